@@ -1,0 +1,125 @@
+//! Ray casting in object order: each solid is intersected only with the rays of the pixels that its projection can reach,
+//! and a depth buffer keeps the nearest hit. Rays of one camera share their origin, so a solid's unit-frame direction is
+//! linear in the pixel and costs three additions.
+
+use super::camera::Camera;
+use super::shapes::{Kind, NEAR, Solid, hit_cuboid, hit_cut, hit_ellipsoid, hit_frustum};
+use super::space::{V3, add, mul, sub, times, to_world};
+
+/// No solid was hit.
+pub(super) const NOTHING: u32 = u32::MAX;
+
+pub(super) struct Hits {
+    /// Z-depth, metres; infinity where nothing was hit.
+    pub depth: Vec<f32>,
+    /// Index of the solid, or [`NOTHING`].
+    pub solid: Vec<u32>,
+}
+
+/// Pixels (inclusive ranges) that a solid may cover and the smallest Z-depth it may have.
+struct Reach {
+    x: (usize, usize),
+    y: (usize, usize),
+    nearest: f32,
+    solid: u32,
+}
+
+pub(super) fn cast(solids: &[Solid], camera: &Camera, width: usize, height: usize) -> Hits {
+    let mut hits =
+        Hits { depth: vec![f32::INFINITY; width * height], solid: vec![NOTHING; width * height] };
+    let mut reaches: Vec<Reach> = solids
+        .iter()
+        .enumerate()
+        .filter_map(|(i, s)| reach(s, i as u32, camera, width, height))
+        .collect();
+    // Near solids first: most of what lies behind them is then skipped by the depth comparison alone.
+    reaches.sort_by(|a, b| a.nearest.total_cmp(&b.nearest));
+    for r in &reaches {
+        let solid = &solids[r.solid as usize];
+        match solid.kind {
+            Kind::Cuboid => scan(solid, r, camera, width, &mut hits, hit_cuboid),
+            Kind::Ellipsoid => scan(solid, r, camera, width, &mut hits, hit_ellipsoid),
+            Kind::Frustum { top } => {
+                scan(solid, r, camera, width, &mut hits, |o, d| hit_frustum(o, d, top))
+            }
+            Kind::Cut { normal, offset } => {
+                scan(solid, r, camera, width, &mut hits, |o, d| hit_cut(o, d, normal, offset))
+            }
+        }
+    }
+    hits
+}
+
+#[inline(always)]
+fn scan(
+    solid: &Solid,
+    r: &Reach,
+    camera: &Camera,
+    width: usize,
+    hits: &mut Hits,
+    hit: impl Fn(V3, V3) -> f32,
+) {
+    let origin = solid.to_unit(sub(camera.at, solid.centre));
+    let right = mul(solid.to_unit(camera.axes[0]), 1.0 / camera.k.fx);
+    let down = mul(solid.to_unit(camera.axes[1]), 1.0 / camera.k.fy);
+    let forward = solid.to_unit(camera.axes[2]);
+    for y in r.y.0..=r.y.1 {
+        let row = add(forward, mul(down, y as f32 - camera.k.cy));
+        let line = y * width;
+        let depths = &mut hits.depth[line + r.x.0..=line + r.x.1];
+        let owners = &mut hits.solid[line + r.x.0..=line + r.x.1];
+        for (k, (depth, owner)) in depths.iter_mut().zip(owners).enumerate() {
+            if *depth <= r.nearest {
+                continue;
+            }
+            let d = add(row, mul(right, (r.x.0 + k) as f32 - camera.k.cx));
+            let t = hit(origin, d);
+            if t < *depth {
+                *depth = t;
+                *owner = r.solid;
+            }
+        }
+    }
+}
+
+/// Projects the bounding box, with the edges that cross the near plane cut there.
+fn reach(solid: &Solid, index: u32, camera: &Camera, width: usize, height: usize) -> Option<Reach> {
+    let mut corners = [[0.0f32; 3]; 8];
+    for (i, c) in corners.iter_mut().enumerate() {
+        let sign = |bit: usize| if i >> bit & 1 == 1 { 1.0 } else { -1.0 };
+        let offset = to_world(&solid.axes, times(solid.half, [sign(0), sign(1), sign(2)]));
+        *c = camera.view(add(solid.centre, offset));
+    }
+    let nearest = corners.iter().fold(f32::INFINITY, |m, c| m.min(c[2]));
+    if corners.iter().all(|c| c[2] <= NEAR) {
+        return None;
+    }
+    let (mut x0, mut x1) = (f32::INFINITY, f32::NEG_INFINITY);
+    let (mut y0, mut y1) = (f32::INFINITY, f32::NEG_INFINITY);
+    let mut project = |p: V3| {
+        let (x, y) = (camera.k.cx + camera.k.fx * p[0] / p[2], camera.k.cy + camera.k.fy * p[1] / p[2]);
+        (x0, x1, y0, y1) = (x0.min(x), x1.max(x), y0.min(y), y1.max(y));
+    };
+    for i in 0..8 {
+        if corners[i][2] > NEAR {
+            project(corners[i]);
+        }
+        for bit in 0..3 {
+            let j = i | 1 << bit;
+            let (a, b) = (corners[i], corners[j]);
+            if j != i && (a[2] > NEAR) != (b[2] > NEAR) {
+                let s = (NEAR - a[2]) / (b[2] - a[2]);
+                project([a[0] + s * (b[0] - a[0]), a[1] + s * (b[1] - a[1]), NEAR]);
+            }
+        }
+    }
+    let (w, h) = (width as f32 - 1.0, height as f32 - 1.0);
+    // Half a pixel of slack against rounding in the projection.
+    let (x0, x1, y0, y1) = (x0 - 0.5, x1 + 0.5, y0 - 0.5, y1 + 0.5);
+    if !(x1 >= 0.0 && y1 >= 0.0 && x0 <= w && y0 <= h) {
+        return None;
+    }
+    let range = |a: f32, b: f32, max: f32| (a.max(0.0).ceil() as usize, b.min(max).floor() as usize);
+    let (x, y) = (range(x0, x1, w), range(y0, y1, h));
+    (x.0 <= x.1 && y.0 <= y.1).then_some(Reach { x, y, nearest: nearest.max(NEAR) * 0.9999, solid: index })
+}

@@ -1,0 +1,198 @@
+//! Which pixels of a dense depth map a sensor would have measured.
+
+use std::str::FromStr;
+
+use image::RgbImage;
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use super::stage::Below;
+use crate::depth::SparseDepth;
+use crate::error::{Error, Result};
+
+/// How measurements are spread over the image.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum SparsePattern {
+    /// Every valid pixel is as likely as every other.
+    Uniform,
+    /// Slightly tilted rows of a scanner, with gaps.
+    Lidar {
+        /// Number of rows, at least 1.
+        lines: usize,
+    },
+    /// Clustered at corners and edges of the picture, as triangulated features are.
+    Sfm,
+}
+
+impl FromStr for SparsePattern {
+    type Err = Error;
+
+    /// `uniform`, `lidar:LINES` or `sfm`.
+    fn from_str(text: &str) -> Result<Self> {
+        let wrong = || Error::argument("sparse pattern", text, "uniform, lidar:LINES (1 to 4096) or sfm");
+        match text {
+            "uniform" => Ok(Self::Uniform),
+            "sfm" => Ok(Self::Sfm),
+            _ => {
+                let lines = text.strip_prefix("lidar:").and_then(|n| n.parse().ok()).ok_or_else(wrong)?;
+                if (1..=4096).contains(&lines) { Ok(Self::Lidar { lines }) } else { Err(wrong()) }
+            }
+        }
+    }
+}
+
+impl SparsePattern {
+    /// Chooses `points` distinct valid pixels (all of them when there are fewer) and keeps their depth bit for bit.
+    ///
+    /// `depth` is row-major `width * height` metres; values that are not finite and positive are never chosen. Fails with
+    /// [`Error::BufferLength`] or [`Error::SizeMismatch`] when sizes disagree, [`Error::Argument`] for zero points or zero lines, and
+    /// [`Error::NoMeasurement`] when no pixel is valid.
+    pub fn sample(
+        &self,
+        rgb: &RgbImage,
+        depth: &[f32],
+        width: usize,
+        height: usize,
+        points: usize,
+        rng: &mut impl Rng,
+    ) -> Result<SparseDepth> {
+        let size = (rgb.width() as usize, rgb.height() as usize);
+        if size != (width, height) {
+            return Err(Error::SizeMismatch { rgb: size, depth: (width, height) });
+        }
+        let mut valid = valid_pixels(depth, width, height, points)?;
+        let points = points.min(valid.len());
+        match *self {
+            Self::Uniform => shuffle_first(&mut valid, points, rng),
+            Self::Lidar { lines } => {
+                if lines == 0 {
+                    return Err(Error::argument("lines", lines, "at least 1"));
+                }
+                let scan = Scan::new(lines, width, height, rng);
+                take_least(&mut valid, points, |i| scan.cost(i, rng));
+            }
+            Self::Sfm => {
+                let weight = feature_weights(rgb, rng);
+                // Smallest exponential waiting times: a weighted choice without replacement.
+                take_least(&mut valid, points, |i| -rng.random::<f32>().max(1e-30).ln() / weight[i]);
+            }
+        }
+        keep(depth, width, height, &valid[..points])
+    }
+}
+
+/// `n` distinct valid pixels (all when there are fewer), each set equally likely, the same for the same seed on every platform.
+///
+/// Fails as [`SparsePattern::sample`] does.
+pub fn sample_points(depth: &[f32], width: usize, height: usize, n: usize, seed: u64) -> Result<SparseDepth> {
+    let mut valid = valid_pixels(depth, width, height, n)?;
+    let n = n.min(valid.len());
+    shuffle_first(&mut valid, n, &mut ChaCha8Rng::seed_from_u64(seed));
+    keep(depth, width, height, &valid[..n])
+}
+
+fn valid_pixels(depth: &[f32], width: usize, height: usize, points: usize) -> Result<Vec<usize>> {
+    let expected = width.saturating_mul(height);
+    if depth.len() != expected {
+        return Err(Error::BufferLength { what: "depth", expected, found: depth.len() });
+    }
+    if points == 0 {
+        return Err(Error::argument("points", points, "at least 1"));
+    }
+    let valid: Vec<usize> = (0..depth.len()).filter(|&i| depth[i].is_finite() && depth[i] > 0.0).collect();
+    if valid.is_empty() { Err(Error::NoMeasurement { width, height }) } else { Ok(valid) }
+}
+
+fn keep(depth: &[f32], width: usize, height: usize, chosen: &[usize]) -> Result<SparseDepth> {
+    let mut sparse = vec![f32::NAN; depth.len()];
+    for &i in chosen {
+        sparse[i] = depth[i];
+    }
+    SparseDepth::new(width, height, sparse)
+}
+
+/// Moves a random choice of `n` elements to the front.
+fn shuffle_first(of: &mut [usize], n: usize, rng: &mut impl Rng) {
+    for i in 0..n {
+        let j = i + rng.next_u32_below(of.len() - i);
+        of.swap(i, j);
+    }
+}
+
+/// Moves the `n` elements of least cost to the front.
+fn take_least(of: &mut [usize], n: usize, mut cost: impl FnMut(usize) -> f32) {
+    let mut keyed: Vec<(f32, usize)> = of.iter().map(|&i| (cost(i), i)).collect();
+    if n < keyed.len() {
+        keyed.select_nth_unstable_by(n, |a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+    }
+    for (slot, (_, i)) in of.iter_mut().zip(keyed) {
+        *slot = i;
+    }
+}
+
+/// Rows of a scanner in the image.
+struct Scan {
+    width: usize,
+    lines: f32,
+    first: f32,
+    spacing: f32,
+    tilt: f32,
+    bend: f32,
+    dropout: f32,
+    seed: u32,
+}
+
+impl Scan {
+    fn new(lines: usize, width: usize, height: usize, rng: &mut impl Rng) -> Self {
+        let h = height as f32;
+        let mut real = |low: f32, high: f32| low + (high - low) * rng.random::<f32>();
+        let (top, bottom) = (h * real(0.0, 0.4), h * real(0.85, 1.0));
+        let spacing = (bottom - top) / lines as f32;
+        Self {
+            width,
+            lines: lines as f32,
+            first: top + real(0.2, 0.8) * spacing,
+            spacing,
+            tilt: real(-0.06, 0.06),
+            bend: real(-0.04, 0.04) * h,
+            dropout: real(0.0, 0.3),
+            seed: rng.random(),
+        }
+    }
+
+    /// Pixels on a row first, at random; then those in its gaps; then the others, nearest first.
+    fn cost(&self, i: usize, rng: &mut impl Rng) -> f32 {
+        let (x, y) = ((i % self.width) as f32, (i / self.width) as f32);
+        let u = 2.0 * x / self.width as f32 - 1.0;
+        let row = y - self.tilt * (x - 0.5 * self.width as f32) - self.bend * u * u;
+        let phase = (row - self.first) / self.spacing;
+        let line = phase.round().clamp(0.0, self.lines - 1.0);
+        let distance = (phase - line).abs() * self.spacing;
+        let shade: f32 = rng.random();
+        if distance > 0.5 {
+            return 2.0 + distance + 0.1 * shade;
+        }
+        // Dark or shiny patches return nothing, and a few single rays are lost.
+        let patch = super::texture::noise(x / 14.0, 0.3 * line, self.seed);
+        if patch < self.dropout || rng.random::<f32>() < 0.05 { 1.0 + shade } else { shade }
+    }
+}
+
+/// Gradient strength times a coarse random cover: real reconstructions have dense and empty regions.
+fn feature_weights(rgb: &RgbImage, rng: &mut impl Rng) -> Vec<f32> {
+    let (w, h) = (rgb.width() as usize, rgb.height() as usize);
+    let grey: Vec<f32> = rgb.pixels().map(|p| p.0.iter().map(|&c| f32::from(c)).sum::<f32>() / 765.0).collect();
+    let seed: u32 = rng.random();
+    let cell = 0.18 * w.max(h) as f32 + 1.0;
+    let mut out = Vec::with_capacity(w * h);
+    for y in 0..h {
+        for x in 0..w {
+            let at = |x: usize, y: usize| grey[y.min(h - 1) * w + x.min(w - 1)];
+            let gx = at(x + 1, y) - at(x.saturating_sub(1), y);
+            let gy = at(x, y + 1) - at(x, y.saturating_sub(1));
+            let cover = super::texture::noise(x as f32 / cell, y as f32 / cell, seed);
+            out.push((gx * gx + gy * gy + 2e-4) * (0.1 + cover * cover * cover));
+        }
+    }
+    out
+}
