@@ -1,0 +1,36 @@
+//! Differentiable kernels for the model: each is a function on candle tensors.
+//!
+//! On the CPU, f32 tensors take a single-pass kernel of this module: vectorised for the instruction
+//! set found at run time, parallel over fixed chunks of rows (so no result depends on the number of
+//! threads), with its own backward pass. Every other device and type takes the same mathematics
+//! composed from candle operations.
+//!
+//! The environment variable `SDIM_KERNEL` = `portable`, `avx2` or `avx512` forces one instruction
+//! set, if the machine has it; it is read once, at the first call.
+//!
+//! This module knows nothing of images or depth, and is the only home of `unsafe` in the crate.
+
+mod activation;
+mod adamw;
+mod attention;
+mod attention_composed;
+mod conv;
+mod exec;
+mod level;
+mod linear;
+mod math;
+mod norm;
+mod panels;
+mod rope;
+mod scale_shift;
+#[cfg(test)]
+mod testing;
+
+pub use activation::{gelu_erf, swiglu};
+pub use adamw::adamw_step;
+pub use attention::{AttentionLayout, Block, attention};
+pub use conv::conv3x3;
+pub use linear::linear;
+pub use norm::rms_norm;
+pub use rope::rope;
+pub use scale_shift::{affine_act, batch_norm_act};

@@ -1,0 +1,333 @@
+//! Matrix product with a right-hand side packed into panels.
+//!
+//! One micro-kernel serves every product of this module: the left-hand side is read in place,
+//! along rows, along columns (a product with its transpose), or in several segments (the three
+//! image rows under a 3x3 filter), so it is never copied.
+
+use super::level::{Level, per_level};
+use super::math::madd;
+
+/// A right-hand side `[k, n]` as panels of 16 or 32 columns, zero-padded: `[panel][k][nr]`.
+pub(in crate::kernels) struct Panels {
+    data: Vec<f32>,
+    k: usize,
+    n: usize,
+    nr: usize,
+}
+
+impl Panels {
+    fn zeros(k: usize, n: usize) -> Panels {
+        let nr = if n <= 16 { 16 } else { 32 };
+        Panels { data: vec![0f32; n.div_ceil(nr) * nr * k], k, n, nr }
+    }
+
+    /// Packs `b`, whose rows of `n` start every `stride` elements.
+    pub(super) fn from_rows(b: &[f32], stride: usize, k: usize, n: usize) -> Panels {
+        let mut panels = Panels::zeros(k, n);
+        let nr = panels.nr;
+        if k == 0 {
+            return panels;
+        }
+        for (p, panel) in panels.data.chunks_exact_mut(nr * k).enumerate() {
+            let cols = nr.min(n - p * nr);
+            for (i, row) in panel.chunks_exact_mut(nr).enumerate() {
+                let from = i * stride + p * nr;
+                row[..cols].copy_from_slice(&b[from..from + cols]);
+            }
+        }
+        panels
+    }
+
+    /// Packs the transpose of `b`, whose `n` rows of `k` start every `stride` elements.
+    pub(super) fn from_columns(b: &[f32], stride: usize, k: usize, n: usize) -> Panels {
+        let mut panels = Panels::zeros(k, n);
+        let nr = panels.nr;
+        if k == 0 {
+            return panels;
+        }
+        for (p, panel) in panels.data.chunks_exact_mut(nr * k).enumerate() {
+            for c in 0..nr.min(n - p * nr) {
+                let from = (p * nr + c) * stride;
+                let column = &b[from..from + k];
+                for (row, value) in panel.chunks_exact_mut(nr).zip(column) {
+                    row[c] = *value;
+                }
+            }
+        }
+        panels
+    }
+}
+
+/// How the left-hand side's rows and inner dimension lie in memory. The inner dimension is
+/// `segments` runs of `length`, which start every `jump` elements.
+#[derive(Clone, Copy)]
+pub(in crate::kernels) struct Lhs<'a> {
+    data: &'a [f32],
+    /// Elements from one row to the next (or, transposed, from one inner index to the next).
+    stride: usize,
+    transposed: bool,
+    segments: usize,
+    length: usize,
+    jump: usize,
+}
+
+impl<'a> Lhs<'a> {
+    /// Rows of `k` that start every `stride` elements.
+    pub(super) fn rows(data: &'a [f32], stride: usize, k: usize) -> Self {
+        Lhs { data, stride, transposed: false, segments: 1, length: k, jump: 0 }
+    }
+
+    /// The transpose of a matrix of `k` rows that start every `stride` elements.
+    pub(super) fn columns(data: &'a [f32], stride: usize, k: usize) -> Self {
+        Lhs { data, stride, transposed: true, segments: 1, length: k, jump: 0 }
+    }
+
+    /// Repeats the inner dimension `segments` times, each `jump` elements on.
+    pub(super) fn segments(self, segments: usize, jump: usize) -> Self {
+        Lhs { segments, jump, ..self }
+    }
+
+    /// One past the largest index read for `m` rows.
+    fn end(&self, m: usize) -> usize {
+        let inner = (self.segments - 1) * self.jump;
+        let (m, length) = (m - 1, self.length - 1);
+        let run = if self.transposed { length * self.stride + m } else { m * self.stride + length };
+        inner + run + 1
+    }
+}
+
+/// What the product is added to.
+#[derive(Clone, Copy)]
+pub(in crate::kernels) enum Init<'a> {
+    Zero,
+    /// One value per column.
+    Bias(&'a [f32]),
+    /// What the destination holds.
+    Add,
+}
+
+per_level!(
+    /// `dst = init + lhs * rhs`, where `dst` has `m` rows of `rhs.n` that start every `stride` elements.
+    fn multiply(dst: &mut [f32], stride: usize, m: usize, lhs: Lhs<'_>, rhs: &Panels, init: Init<'_>) = multiply_body
+);
+
+#[inline(always)]
+fn multiply_body<const LANES: usize>(
+    dst: &mut [f32],
+    stride: usize,
+    m: usize,
+    lhs: Lhs<'_>,
+    rhs: &Panels,
+    init: Init<'_>,
+) {
+    if m == 0 || rhs.n == 0 {
+        return;
+    }
+    assert_eq!(lhs.segments * lhs.length, rhs.k, "inner dimensions");
+    assert!(rhs.k == 0 || lhs.end(m) <= lhs.data.len(), "left-hand side too short");
+    assert!((m - 1) * stride + rhs.n <= dst.len(), "destination too short");
+    assert!(rhs.data.len() == rhs.n.div_ceil(rhs.nr) * rhs.nr * rhs.k, "panels");
+    for p in 0..rhs.n.div_ceil(rhs.nr) {
+        let panel = &rhs.data[p * rhs.k * rhs.nr..(p + 1) * rhs.k * rhs.nr];
+        // Widths and heights of the register tile: as many sums as the registers of each
+        // instruction set hold beside the operands.
+        match (LANES, rhs.nr) {
+            (16, 32) => strip::<LANES, 12, 32>(dst, stride, m, lhs, panel, rhs, p * 32, init),
+            (16, _) => strip::<LANES, 12, 16>(dst, stride, m, lhs, panel, rhs, p * 16, init),
+            (8, nr) => {
+                for off in (0..nr).step_by(16) {
+                    strip::<LANES, 6, 16>(dst, stride, m, lhs, panel, rhs, p * nr + off, init);
+                }
+            }
+            (_, nr) => {
+                for off in (0..nr).step_by(8) {
+                    strip::<LANES, 6, 8>(dst, stride, m, lhs, panel, rhs, p * nr + off, init);
+                }
+            }
+        }
+    }
+}
+
+/// `W` columns of the product, from column `col` on.
+#[inline(always)]
+#[allow(clippy::too_many_arguments)]
+fn strip<const LANES: usize, const MR: usize, const W: usize>(
+    dst: &mut [f32],
+    stride: usize,
+    m: usize,
+    lhs: Lhs<'_>,
+    panel: &[f32],
+    rhs: &Panels,
+    col: usize,
+    init: Init<'_>,
+) {
+    if col >= rhs.n {
+        return;
+    }
+    let b = Strip { panel, nr: rhs.nr, off: col % rhs.nr, col, cols: W.min(rhs.n - col) };
+    let mut r = 0;
+    while r + MR <= m {
+        block::<LANES, MR, W>(dst, stride, r, lhs, b, init);
+        r += MR;
+    }
+    while r + 4 <= m {
+        block::<LANES, 4, W>(dst, stride, r, lhs, b, init);
+        r += 4;
+    }
+    while r < m {
+        block::<LANES, 1, W>(dst, stride, r, lhs, b, init);
+        r += 1;
+    }
+}
+
+#[derive(Clone, Copy)]
+struct Strip<'a> {
+    panel: &'a [f32],
+    nr: usize,
+    /// First column within the panel.
+    off: usize,
+    /// First column of the product.
+    col: usize,
+    /// Columns that exist.
+    cols: usize,
+}
+
+#[inline(always)]
+fn block<const LANES: usize, const MR: usize, const W: usize>(
+    dst: &mut [f32],
+    stride: usize,
+    row: usize,
+    lhs: Lhs<'_>,
+    b: Strip<'_>,
+    init: Init<'_>,
+) {
+    let mut acc = [[0f32; W]; MR];
+    if let Init::Bias(bias) = init {
+        for acc in &mut acc {
+            acc[..b.cols].copy_from_slice(&bias[b.col..b.col + b.cols]);
+        }
+    }
+    // SAFETY: `multiply_body` checked that the left-hand side reaches its last row and inner index
+    // and that the panel holds `k` rows of `nr`; `off + W <= nr`.
+    let acc = unsafe {
+        if lhs.transposed {
+            tile::<LANES, MR, W, true>(acc, row, lhs, b)
+        } else {
+            tile::<LANES, MR, W, false>(acc, row, lhs, b)
+        }
+    };
+    for (r, acc) in acc.iter().enumerate() {
+        let from = (row + r) * stride + b.col;
+        let out = &mut dst[from..from + b.cols];
+        if let Init::Add = init {
+            for (o, a) in out.iter_mut().zip(acc) {
+                *o += a;
+            }
+        } else if b.cols == W {
+            out.copy_from_slice(acc);
+        } else {
+            for (o, a) in out.iter_mut().zip(acc) {
+                *o = *a;
+            }
+        }
+    }
+}
+
+/// Sums of `MR` rows by `W` columns, kept in registers over the whole inner dimension.
+///
+/// # Safety
+/// For `MR` rows from `row` and every inner index, `lhs` must be in bounds; `b.panel` must hold
+/// as many rows of `b.nr`, and `b.off + W <= b.nr`.
+#[inline(always)]
+unsafe fn tile<const LANES: usize, const MR: usize, const W: usize, const TRANSPOSED: bool>(
+    mut acc: [[f32; W]; MR],
+    row: usize,
+    lhs: Lhs<'_>,
+    b: Strip<'_>,
+) -> [[f32; W]; MR] {
+    // SAFETY: the caller's promise.
+    unsafe {
+        let mut right = b.panel.as_ptr().add(b.off);
+        let start = lhs.data.as_ptr().add(if TRANSPOSED { row } else { row * lhs.stride });
+        for segment in 0..lhs.segments {
+            let left = start.add(segment * lhs.jump);
+            for i in 0..lhs.length {
+                let columns = &*right.cast::<[f32; W]>();
+                for (r, acc) in acc.iter_mut().enumerate() {
+                    let at = if TRANSPOSED { i * lhs.stride + r } else { r * lhs.stride + i };
+                    let x = *left.add(at);
+                    for c in 0..W {
+                        acc[c] = madd::<LANES>(x, columns[c], acc[c]);
+                    }
+                }
+                right = right.wrapping_add(b.nr);
+            }
+        }
+    }
+    acc
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::testing::{random, values};
+    use super::*;
+
+    fn naive(a: &[f32], b: &[f32], m: usize, k: usize, n: usize) -> Vec<f64> {
+        let mut out = vec![0f64; m * n];
+        for i in 0..m {
+            for j in 0..n {
+                out[i * n + j] = (0..k).map(|p| a[i * k + p] as f64 * b[p * n + j] as f64).sum();
+            }
+        }
+        out
+    }
+
+    fn transpose(a: &[f32], rows: usize, cols: usize) -> Vec<f32> {
+        (0..rows * cols).map(|i| a[i % rows * cols + i / rows]).collect()
+    }
+
+    #[test]
+    fn every_form_is_the_plain_product() {
+        for (m, k, n) in [(1, 1, 1), (13, 7, 16), (29, 5, 17), (3, 70, 33), (37, 12, 100)] {
+            let (a, b) = (values(&random(&[m, k], 1)), values(&random(&[k, n], 2)));
+            let (at, bt) = (transpose(&a, m, k), transpose(&b, k, n));
+            let exact = naive(&a, &b, m, k, n);
+            let bias: Vec<f32> = (0..n).map(|j| j as f32).collect();
+            for level in Level::available() {
+                let panels = [Panels::from_rows(&b, n, k, n), Panels::from_columns(&bt, k, k, n)];
+                let lefts = [Lhs::rows(&a, k, k), Lhs::columns(&at, m, k)];
+                for (rhs, lhs) in [(0, 0), (0, 1), (1, 0), (1, 1)] {
+                    // A stride above n: what lies between the rows must stay.
+                    let mut dst = vec![5f32; m * (n + 1)];
+                    multiply(level, &mut dst, n + 1, m, lefts[lhs], &panels[rhs], Init::Bias(&bias));
+                    multiply(level, &mut dst, n + 1, m, lefts[lhs], &panels[rhs], Init::Add);
+                    for i in 0..m {
+                        for j in 0..n {
+                            let expected = 2.0 * exact[i * n + j] + j as f64;
+                            let found = dst[i * (n + 1) + j] as f64;
+                            assert!((found - expected).abs() < 1e-4, "{m}x{k}x{n} {} {i},{j}", level.name());
+                        }
+                        assert_eq!(dst[i * (n + 1) + n], 5.0);
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn segments_are_one_inner_dimension() {
+        let a = values(&random(&[40], 1));
+        let b = values(&random(&[6, 3], 2));
+        for level in Level::available() {
+            let mut dst = vec![0f32; 9];
+            let lhs = Lhs::rows(&a, 2, 3).segments(2, 20);
+            multiply(level, &mut dst, 3, 3, lhs, &Panels::from_rows(&b, 3, 6, 3), Init::Zero);
+            for (i, found) in dst.iter().enumerate() {
+                let (r, c) = (i / 3, i % 3);
+                let expected: f32 =
+                    (0..6).map(|p| a[r * 2 + p % 3 + p / 3 * 20] * b[p * 3 + c]).sum();
+                assert!((found - expected).abs() < 1e-5);
+            }
+        }
+    }
+}
