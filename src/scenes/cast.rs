@@ -6,6 +6,9 @@ use super::camera::Camera;
 use super::shapes::{Kind, NEAR, Solid, hit_cuboid, hit_cut, hit_ellipsoid, hit_frustum};
 use super::space::{V3, add, mul, sub, times, to_world};
 
+/// Pixels that are skipped together behind nearer solids.
+const RUN: usize = 16;
+
 /// No solid was hit.
 pub(super) const NOTHING: u32 = u32::MAX;
 
@@ -68,15 +71,18 @@ fn scan(
         let line = y * width;
         let depths = &mut hits.depth[line + r.x.0..=line + r.x.1];
         let owners = &mut hits.solid[line + r.x.0..=line + r.x.1];
-        for (k, (depth, owner)) in depths.iter_mut().zip(owners).enumerate() {
-            if *depth <= r.nearest {
+        for (n, (depths, owners)) in depths.chunks_mut(RUN).zip(owners.chunks_mut(RUN)).enumerate() {
+            let deepest = depths.iter().fold(0.0, |m: f32, &d| if d > m { d } else { m });
+            if deepest <= r.nearest {
                 continue;
             }
-            let d = add(row, mul(right, (r.x.0 + k) as f32 - camera.k.cx));
-            let t = hit(origin, d);
-            if t < *depth {
-                *depth = t;
-                *owner = r.solid;
+            let first = (r.x.0 + n * RUN) as f32 - camera.k.cx;
+            // Without branches, so that the compiler can take several pixels at once.
+            for (k, (depth, owner)) in depths.iter_mut().zip(owners).enumerate() {
+                let t = hit(origin, add(row, mul(right, first + k as f32)));
+                let closer = t < *depth;
+                *depth = if closer { t } else { *depth };
+                *owner = if closer { r.solid } else { *owner };
             }
         }
     }

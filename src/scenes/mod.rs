@@ -5,6 +5,7 @@
 
 mod camera;
 mod cast;
+mod folder;
 mod furniture;
 mod light;
 mod patterns;
@@ -16,11 +17,12 @@ mod streets;
 mod texture;
 
 use image::RgbImage;
-use rand::SeedableRng;
+use rand::{RngCore, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::error::{Error, Result};
 pub use camera::Intrinsics;
+pub use folder::{DepthFile, FolderDataset, Sample, write_frame};
 pub use patterns::{SparsePattern, sample_points};
 use stage::Stage;
 
@@ -62,17 +64,22 @@ pub fn procedural(seed: u64, width: usize, height: usize) -> Result<RgbdFrame> {
     }
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     // A camera may end up before a blank wall or under the floor; a few scenes are thrown away for that.
-    for _ in 0..4 {
-        let (frame, good) = attempt(&mut rng, width, height);
-        if good {
-            return Ok(frame);
+    let (mut stage, mut hits) = attempt(&mut rng, width, height);
+    for _ in 0..6 {
+        if interesting(&hits) {
+            break;
         }
+        (stage, hits) = attempt(&mut rng, width, height);
     }
-    Ok(attempt(&mut rng, width, height).0)
+    let colour = light::shade(&mut stage, &hits, width);
+    let rgb = light::develop(&mut stage, colour, width, height);
+    // The whole scene in another size looks the same: sizes must be learnt from the measurements.
+    let scale = if stage.chance(0.5) { stage.log(0.5, 2.0) } else { 1.0 };
+    let depth = hits.depth.iter().map(|&t| if t.is_finite() { t * scale } else { f32::NAN }).collect();
+    Ok(RgbdFrame { rgb, depth, intrinsics: stage.camera.k })
 }
 
-fn attempt(rng: &mut ChaCha8Rng, width: usize, height: usize) -> (RgbdFrame, bool) {
-    use rand::RngCore;
+fn attempt(rng: &mut ChaCha8Rng, width: usize, height: usize) -> (Stage, cast::Hits) {
     let own = ChaCha8Rng::seed_from_u64(rng.next_u64());
     let start = camera::Camera::new(Intrinsics::from_fov(width, height, 1.0), [0.0; 3], 0.0, 0.0, 0.0);
     let mut stage = Stage::new(own, start);
@@ -89,13 +96,7 @@ fn attempt(rng: &mut ChaCha8Rng, width: usize, height: usize) -> (RgbdFrame, boo
         _ => stage.yard(k),
     }
     let hits = cast::cast(&stage.solids, &stage.camera, width, height);
-    let good = interesting(&hits);
-    let colour = light::shade(&mut stage, &hits, width);
-    let rgb = light::develop(&mut stage, colour, width, height);
-    // The whole scene in another size looks the same: sizes must be learnt from the measurements.
-    let scale = if stage.chance(0.5) { stage.log(0.5, 2.0) } else { 1.0 };
-    let depth = hits.depth.iter().map(|&t| if t.is_finite() { t * scale } else { f32::NAN }).collect();
-    (RgbdFrame { rgb, depth, intrinsics: k }, good)
+    (stage, hits)
 }
 
 /// Enough returns, several solids, nothing pressed against the lens.

@@ -71,15 +71,26 @@ fn frustum_normal(p: V3, top: f32) -> V3 {
     }
 }
 
-/// Entry and exit of a ray through [-1, 1]^3. `inv` is 1 / direction, so axis-parallel rays come as infinities.
+/// `f32::min` and `max` spend instructions on NaN; these map to one each.
+#[inline(always)]
+fn smaller(a: f32, b: f32) -> f32 {
+    if a < b { a } else { b }
+}
+
+#[inline(always)]
+fn larger(a: f32, b: f32) -> f32 {
+    if a > b { a } else { b }
+}
+
+/// Entry and exit of a ray through [-1, 1]^3; axis-parallel rays come as infinities.
 #[inline(always)]
 fn slabs(o: V3, d: V3) -> (f32, f32) {
     let (mut t0, mut t1) = (f32::NEG_INFINITY, f32::INFINITY);
     for k in 0..3 {
         let inv = 1.0 / d[k];
         let (a, b) = ((-1.0 - o[k]) * inv, (1.0 - o[k]) * inv);
-        t0 = t0.max(a.min(b));
-        t1 = t1.min(a.max(b));
+        t0 = larger(t0, smaller(a, b));
+        t1 = smaller(t1, larger(a, b));
     }
     (t0, t1)
 }
@@ -88,7 +99,7 @@ fn slabs(o: V3, d: V3) -> (f32, f32) {
 #[inline(always)]
 pub(super) fn hit_cuboid(o: V3, d: V3) -> f32 {
     let (t0, t1) = slabs(o, d);
-    if t0 <= t1 && t0 > NEAR { t0 } else { f32::INFINITY }
+    if (t0 <= t1) & (t0 > NEAR) { t0 } else { f32::INFINITY }
 }
 
 #[inline(always)]
@@ -112,11 +123,8 @@ pub(super) fn hit_ellipsoid(o: V3, d: V3) -> f32 {
     let dd = dot(d, d);
     let tm = -dot(o, d) / dd;
     let m = sub(o, [-tm * d[0], -tm * d[1], -tm * d[2]]);
-    let gap = 1.0 - dot(m, m);
-    if gap < 0.0 {
-        return f32::INFINITY;
-    }
-    let t = tm - (gap / dd).sqrt();
+    // Beside the ball the root is NaN, which is not > NEAR.
+    let t = tm - ((1.0 - dot(m, m)) / dd).sqrt();
     if t > NEAR { t } else { f32::INFINITY }
 }
 
