@@ -4,7 +4,9 @@ use std::path::Path;
 
 use ndarray::ArrayView2;
 
-use super::{DepthScale, SparseDepth, check_length, files, is_valid, npy, pixel_count, png16, view2};
+use super::{
+    DepthScale, SparseDepth, check_length, files, is_valid, npy, pixel_count, png16, view2,
+};
 use crate::error::{Error, Result};
 
 /// Dense depth in metres (Z-depth) with a confidence, an expected error and a "measured" mark per pixel, all row-major.
@@ -60,11 +62,17 @@ impl DepthMap {
 
     /// Brings an invalid pixel into its one form, and refuses a valid one with values out of range.
     fn check_pixel(&mut self, pixel: usize) -> Result<()> {
-        let place = |value: f32| format!("{value} at pixel ({}, {})", pixel % self.width, pixel / self.width);
+        let place = |value: f32| {
+            format!("{value} at pixel ({}, {})", pixel % self.width, pixel / self.width)
+        };
         let (confidence, error) = (self.confidence[pixel], self.expected_error[pixel]);
         if !is_valid(self.depth[pixel]) {
             if self.measured[pixel] {
-                return Err(Error::argument("measured depth", place(self.depth[pixel]), "a finite depth above 0 m"));
+                return Err(Error::argument(
+                    "measured depth",
+                    place(self.depth[pixel]),
+                    "a finite depth above 0 m",
+                ));
             }
             self.depth[pixel] = f32::NAN;
             self.confidence[pixel] = 0.0;
@@ -72,7 +80,11 @@ impl DepthMap {
         } else if !(0.0..=1.0).contains(&confidence) {
             return Err(Error::argument("confidence", place(confidence), "a value in 0..=1"));
         } else if !(error.is_finite() && error >= 0.0) {
-            return Err(Error::argument("expected error", place(error), "a finite value of at least 0 m"));
+            return Err(Error::argument(
+                "expected error",
+                place(error),
+                "a finite value of at least 0 m",
+            ));
         }
         Ok(())
     }
@@ -143,8 +155,12 @@ impl DepthMap {
     /// Whether every measurement of `sparse` stands in this map bit for bit and is marked as measured, and nothing else is.
     pub fn keeps(&self, sparse: &SparseDepth) -> bool {
         (self.width, self.height) == (sparse.width(), sparse.height())
-            && (sparse.as_slice().iter().zip(&self.depth).zip(&self.measured))
-                .all(|((given, kept), &measured)| measured != given.is_nan() && (given.is_nan() || given.to_bits() == kept.to_bits()))
+            && (sparse.as_slice().iter().zip(&self.depth).zip(&self.measured)).all(
+                |((given, kept), &measured)| {
+                    measured != given.is_nan()
+                        && (given.is_nan() || given.to_bits() == kept.to_bits())
+                },
+            )
     }
 
     /// The map as a 16-bit grey PNG in memory, with depth in units of `scale`, 0 where invalid.
@@ -214,10 +230,22 @@ mod tests {
         let good = || (vec![1.0; 4], vec![0.5; 4], vec![0.1; 4], vec![false; 4]);
         let build = |(d, c, e, m)| DepthMap::new(2, 2, d, c, e, m);
         assert!(build(good()).is_ok());
-        assert!(matches!(build((vec![1.0; 3], good().1, good().2, good().3)), Err(Error::BufferLength { what: "depth", .. })));
-        assert!(matches!(build((good().0, vec![0.5; 5], good().2, good().3)), Err(Error::BufferLength { what: "confidence", .. })));
-        assert!(matches!(build((good().0, good().1, vec![], good().3)), Err(Error::BufferLength { .. })));
-        assert!(matches!(build((good().0, good().1, good().2, vec![true])), Err(Error::BufferLength { .. })));
+        assert!(matches!(
+            build((vec![1.0; 3], good().1, good().2, good().3)),
+            Err(Error::BufferLength { what: "depth", .. })
+        ));
+        assert!(matches!(
+            build((good().0, vec![0.5; 5], good().2, good().3)),
+            Err(Error::BufferLength { what: "confidence", .. })
+        ));
+        assert!(matches!(
+            build((good().0, good().1, vec![], good().3)),
+            Err(Error::BufferLength { .. })
+        ));
+        assert!(matches!(
+            build((good().0, good().1, good().2, vec![true])),
+            Err(Error::BufferLength { .. })
+        ));
         for bad in [-0.1, 1.1, f32::NAN] {
             let result = build((good().0, vec![1.0, bad, 1.0, 1.0], good().2, good().3));
             assert!(matches!(result, Err(Error::Argument { name: "confidence", .. })));
@@ -226,8 +254,14 @@ mod tests {
             let result = build((good().0, good().1, vec![0.0, 0.0, 0.0, bad], good().3));
             assert!(result.unwrap_err().to_string().contains("(1, 1)"));
         }
-        assert!(matches!(map([0.0; 4], [true; 4]), Err(Error::Argument { name: "measured depth", .. })));
-        assert!(matches!(DepthMap::new(0, 0, vec![], vec![], vec![], vec![]), Err(Error::ImageSize { .. })));
+        assert!(matches!(
+            map([0.0; 4], [true; 4]),
+            Err(Error::Argument { name: "measured depth", .. })
+        ));
+        assert!(matches!(
+            DepthMap::new(0, 0, vec![], vec![], vec![], vec![]),
+            Err(Error::ImageSize { .. })
+        ));
     }
 
     #[test]
@@ -238,7 +272,11 @@ mod tests {
         assert!(!map([5.0, next, 5.0, 5.0], [false, true, false, false]).unwrap().keeps(&sparse));
         assert!(!map([5.0, 0.1, 5.0, 5.0], [false; 4]).unwrap().keeps(&sparse));
         assert!(!map([5.0, 0.1, 5.0, 5.0], [true, true, false, false]).unwrap().keeps(&sparse));
-        assert!(!map([0.1; 4], [true; 4]).unwrap().keeps(&SparseDepth::from_points(4, 1, &[(0, 0, 0.1)]).unwrap()));
+        assert!(
+            !map([0.1; 4], [true; 4])
+                .unwrap()
+                .keeps(&SparseDepth::from_points(4, 1, &[(0, 0, 0.1)]).unwrap())
+        );
     }
 
     #[test]
@@ -246,7 +284,10 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("depth.png");
         let map = map([1.5, f32::NAN, 70.0, 65.535], [false; 4]).unwrap();
-        assert_eq!(map.write_png16(&path, DepthScale::millimetres()).unwrap(), Saturation { pixels: 1 });
+        assert_eq!(
+            map.write_png16(&path, DepthScale::millimetres()).unwrap(),
+            Saturation { pixels: 1 }
+        );
         assert_eq!(png16::read_png16(&path).unwrap(), (2, 2, vec![1500, 0, 65535, 65535]));
         assert_eq!(map.write_png16(&path, DepthScale::kitti()).unwrap(), Saturation { pixels: 0 });
         let back = SparseDepth::read(&path, Some(DepthScale::kitti())).unwrap();
@@ -262,7 +303,9 @@ mod tests {
         map.write_confidence_npy(&confidence).unwrap();
         let back = SparseDepth::read(&depth, None).unwrap();
         assert!(back.as_slice().iter().zip(map.depth()).all(|(a, b)| a.to_bits() == b.to_bits()));
-        assert!(matches!(npy::read_npy(&confidence).unwrap().values, npy::Values::F32(c) if c == [0.5, 0.0, 0.5, 0.5]));
+        assert!(
+            matches!(npy::read_npy(&confidence).unwrap().values, npy::Values::F32(c) if c == [0.5, 0.0, 0.5, 0.5])
+        );
         assert!(matches!(map.write_npy(dir.path().join("no/d.npy")), Err(Error::Io { .. })));
     }
 }

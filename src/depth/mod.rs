@@ -3,13 +3,16 @@
 //! Everywhere in this module depth is Z-depth (along the optical axis) in metres, `f32`, row-major, `width * height`
 //! values; x grows to the right, y grows downwards; a missing value is NaN in memory and 0 in integer files.
 
+pub mod colour;
 mod files;
 pub mod interpolate;
+mod label;
 mod map;
 pub(crate) mod mesh;
 pub mod metrics;
 pub mod npy;
 pub mod png16;
+pub mod preview;
 mod scale;
 mod sparse;
 

@@ -51,7 +51,12 @@ pub fn read_npy(path: impl AsRef<Path>) -> Result<Npy> {
 /// # Errors
 /// [`Error::ImageSize`], [`Error::BufferLength`] unless there are `width * height` values, [`Error::Io`]; the file is then as
 /// it was before.
-pub fn write_npy(path: impl AsRef<Path>, width: usize, height: usize, values: &[f32]) -> Result<()> {
+pub fn write_npy(
+    path: impl AsRef<Path>,
+    width: usize,
+    height: usize,
+    values: &[f32],
+) -> Result<()> {
     files::write_whole(path.as_ref(), &encode(width, height, values)?)
 }
 
@@ -61,9 +66,10 @@ pub fn write_npy(path: impl AsRef<Path>, width: usize, height: usize, values: &[
 /// [`Error::ImageSize`], [`Error::BufferLength`] unless there are `width * height` values.
 pub fn encode(width: usize, height: usize, values: &[f32]) -> Result<Vec<u8>> {
     check_length("npy array", values.len(), pixel_count(width, height)?)?;
-    let mut header = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({height}, {width}), }}");
+    let mut header =
+        format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({height}, {width}), }}");
     // The format asks for data that starts at a multiple of 64 bytes and a header that ends in a newline.
-    while (MAGIC.len() + 4 + header.len() + 1) % 64 != 0 {
+    while !(MAGIC.len() + 4 + header.len() + 1).is_multiple_of(64) {
         header.push(' ');
     }
     header.push('\n');
@@ -87,7 +93,11 @@ fn read_from(mut reader: impl Read, path: &Path) -> Result<Npy> {
     reader.take(expected as u64 + 1).read_to_end(&mut data).map_err(Error::io(path))?;
     if data.len() != expected {
         let found = if data.len() > expected { "more".to_string() } else { data.len().to_string() };
-        return Err(Error::format(path, format!("{found} bytes of data"), format!("{expected} for shape ({height}, {width})")));
+        return Err(Error::format(
+            path,
+            format!("{found} bytes of data"),
+            format!("{expected} for shape ({height}, {width})"),
+        ));
     }
     Ok(Npy { width, height, values: kind.decode(&data) })
 }
@@ -100,14 +110,25 @@ fn read_header(reader: &mut impl Read, path: &Path) -> Result<String> {
     let length = match start[6] {
         1 => usize::from(u16::from_le_bytes(read_array(reader, path)?)),
         2 | 3 => u32::from_le_bytes(read_array(reader, path)?) as usize,
-        version => return Err(Error::format(path, format!("format version {version}"), "version 1, 2 or 3")),
+        version => {
+            return Err(Error::format(
+                path,
+                format!("format version {version}"),
+                "version 1, 2 or 3",
+            ));
+        }
     };
     if length > MAX_HEADER {
-        return Err(Error::format(path, format!("a header of {length} bytes"), format!("at most {MAX_HEADER}")));
+        return Err(Error::format(
+            path,
+            format!("a header of {length} bytes"),
+            format!("at most {MAX_HEADER}"),
+        ));
     }
     let mut header = vec![0; length];
     reader.read_exact(&mut header).map_err(|e| truncated(e, path))?;
-    String::from_utf8(header).map_err(|_| Error::format(path, "a header that is not text", EXPECTED))
+    String::from_utf8(header)
+        .map_err(|_| Error::format(path, "a header that is not text", EXPECTED))
 }
 
 fn read_array<const N: usize>(reader: &mut impl Read, path: &Path) -> Result<[u8; N]> {
@@ -118,7 +139,9 @@ fn read_array<const N: usize>(reader: &mut impl Read, path: &Path) -> Result<[u8
 
 fn truncated(error: std::io::Error, path: &Path) -> Error {
     match error.kind() {
-        std::io::ErrorKind::UnexpectedEof => Error::format(path, "the end of the file inside the header", EXPECTED),
+        std::io::ErrorKind::UnexpectedEof => {
+            Error::format(path, "the end of the file inside the header", EXPECTED)
+        }
         _ => Error::io(path)(error),
     }
 }
@@ -141,12 +164,19 @@ impl Kind {
 
     fn decode(self, data: &[u8]) -> Values {
         match self {
-            Kind::F32 => Values::F32(data.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect()),
+            Kind::F32 => Values::F32(
+                data.chunks_exact(4)
+                    .map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]]))
+                    .collect(),
+            ),
             Kind::F64 => {
-                let value = |b: &[u8]| f64::from_le_bytes([b[0], b[1], b[2], b[3], b[4], b[5], b[6], b[7]]);
+                let value =
+                    |b: &[u8]| f64::from_le_bytes([b[0], b[1], b[2], b[3], b[4], b[5], b[6], b[7]]);
                 Values::F64(data.chunks_exact(8).map(value).collect())
             }
-            Kind::U16 => Values::U16(data.chunks_exact(2).map(|b| u16::from_le_bytes([b[0], b[1]])).collect()),
+            Kind::U16 => Values::U16(
+                data.chunks_exact(2).map(|b| u16::from_le_bytes([b[0], b[1]])).collect(),
+            ),
         }
     }
 }
@@ -179,8 +209,10 @@ fn parse_header(header: &str) -> std::result::Result<(Kind, usize, usize), Strin
 
 /// What stands behind a key.
 fn field<'a>(header: &'a str, key: &str) -> std::result::Result<&'a str, String> {
-    let behind = |quote: char| header.split_once(&format!("{quote}{key}{quote}")).map(|(_, rest)| rest);
-    let rest = behind('\'').or_else(|| behind('"')).and_then(|rest| rest.trim_start().strip_prefix(':'));
+    let behind =
+        |quote: char| header.split_once(&format!("{quote}{key}{quote}")).map(|(_, rest)| rest);
+    let rest =
+        behind('\'').or_else(|| behind('"')).and_then(|rest| rest.trim_start().strip_prefix(':'));
     rest.map(str::trim_start).ok_or_else(|| format!("a header without `{key}`"))
 }
 
@@ -260,7 +292,10 @@ mod tests {
         ];
         for case in cases {
             let result = read(&file(&case, &[0; 16]));
-            assert!(matches!(result, Err(Error::Format { .. } | Error::ImageSize { .. })), "{case}: {result:?}");
+            assert!(
+                matches!(result, Err(Error::Format { .. } | Error::ImageSize { .. })),
+                "{case}: {result:?}"
+            );
         }
         let big_claim = read(&file(&header("<f4", "False", "(16384, 16384)"), &[0; 16]));
         assert!(matches!(big_claim, Err(Error::Format { .. })), "{big_claim:?}");
