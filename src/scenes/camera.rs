@@ -2,8 +2,10 @@
 
 use super::space::{Rot, V3, add, mul, sub, to_local, turned};
 
-/// Pinhole intrinsics, pixels. Pixel `(x, y)` looks along `((x - cx) / fx, (y - cy) / fy, 1)`, with x to the right, y down
-/// and integer coordinates at pixel centres.
+/// Pinhole intrinsics, pixels.
+///
+/// Pixel `(x, y)` looks along `((x - cx) / fx, (y - cy) / fy, 1)`, with x to the right, y down and integer coordinates
+/// at pixel centres.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Intrinsics {
     /// Focal length along x.
@@ -40,8 +42,8 @@ impl Camera {
         Self { k, at, axes: [right, mul(up, -1.0), forward] }
     }
 
-    /// World direction of a pixel, scaled so that one unit along it is one metre of Z-depth. A hit at parameter `t` along it
-    /// has Z-depth `t` exactly.
+    /// World direction of a pixel, scaled so that one unit along it is one metre of Z-depth: a hit at parameter `t` has
+    /// Z-depth `t` exactly.
     #[inline(always)]
     pub fn ray(&self, x: f32, y: f32) -> V3 {
         let (u, v) = ((x - self.k.cx) / self.k.fx, (y - self.k.cy) / self.k.fy);

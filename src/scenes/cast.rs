@@ -28,13 +28,9 @@ struct Reach {
 }
 
 pub(super) fn cast(solids: &[Solid], camera: &Camera, width: usize, height: usize) -> Hits {
-    let mut hits =
-        Hits { depth: vec![f32::INFINITY; width * height], solid: vec![NOTHING; width * height] };
-    let mut reaches: Vec<Reach> = solids
-        .iter()
-        .enumerate()
-        .filter_map(|(i, s)| reach(s, i as u32, camera, width, height))
-        .collect();
+    let mut hits = Hits { depth: vec![f32::INFINITY; width * height], solid: vec![NOTHING; width * height] };
+    let mut reaches: Vec<Reach> =
+        solids.iter().enumerate().filter_map(|(i, s)| reach(s, i as u32, camera, width, height)).collect();
     // Near solids first: most of what lies behind them is then skipped by the depth comparison alone.
     reaches.sort_by(|a, b| a.nearest.total_cmp(&b.nearest));
     for r in &reaches {
@@ -42,9 +38,7 @@ pub(super) fn cast(solids: &[Solid], camera: &Camera, width: usize, height: usiz
         match solid.kind {
             Kind::Cuboid => scan(solid, r, camera, width, &mut hits, hit_cuboid),
             Kind::Ellipsoid => scan(solid, r, camera, width, &mut hits, hit_ellipsoid),
-            Kind::Frustum { top } => {
-                scan(solid, r, camera, width, &mut hits, |o, d| hit_frustum(o, d, top))
-            }
+            Kind::Frustum { top } => scan(solid, r, camera, width, &mut hits, |o, d| hit_frustum(o, d, top)),
             Kind::Cut { normal, offset } => {
                 scan(solid, r, camera, width, &mut hits, |o, d| hit_cut(o, d, normal, offset))
             }

@@ -43,8 +43,8 @@ pub struct FolderDataset {
 impl FolderDataset {
     /// Lists `dir`. `scale` is the unit of its 16-bit PNGs and integer npy files.
     ///
-    /// Fails with [`Error::Io`] when `rgb` or `gt` cannot be listed, and with [`Error::Format`] naming the file when a picture has
-    /// no ground truth, a ground truth no picture, or there is no frame at all.
+    /// Fails with [`Error::Io`] when `rgb` or `gt` cannot be listed, and with [`Error::Format`] naming the file when a
+    /// picture has no ground truth, a ground truth or measurement no picture, or there is no frame at all.
     pub fn open(dir: impl AsRef<Path>, scale: DepthScale) -> Result<Self> {
         let dir = dir.as_ref();
         let pictures = list(&dir.join("rgb"), &PICTURES)?;
@@ -54,13 +54,21 @@ impl FolderDataset {
         let mut entries = Vec::with_capacity(pictures.len());
         for (name, rgb) in pictures {
             let Some(gt) = take(&mut truths, &name) else {
-                return Err(Error::format(rgb, "no ground truth for it", format!("gt/{name}.png or gt/{name}.npy")));
+                return Err(Error::format(
+                    rgb,
+                    "no ground truth for it",
+                    format!("gt/{name}.png or gt/{name}.npy"),
+                ));
             };
             let sparse = take(&mut measured, &name);
             entries.push(Entry { name, rgb, gt, sparse });
         }
         if let Some((name, path)) = truths.into_iter().chain(measured).next() {
-            return Err(Error::format(path, "no picture for it", format!("rgb/{name}.png or rgb/{name}.jpg")));
+            return Err(Error::format(
+                path,
+                "no picture for it",
+                format!("rgb/{name}.png or rgb/{name}.jpg"),
+            ));
         }
         if entries.is_empty() {
             return Err(Error::format(dir.join("rgb"), "no picture", "at least one .png or .jpg"));
@@ -83,8 +91,10 @@ impl FolderDataset {
         self.entries.iter().map(|e| e.name.as_str())
     }
 
-    /// Reads frame `index`. Fails with [`Error::Argument`] beyond the last frame, and with an error naming the file when one
-    /// cannot be read or differs in size from its picture.
+    /// Reads frame `index`.
+    ///
+    /// Fails with [`Error::Argument`] beyond the last frame, and with an error naming the file when one cannot be read or
+    /// differs in size from its picture.
     pub fn load(&self, index: usize) -> Result<Sample> {
         let Some(entry) = self.entries.get(index) else {
             return Err(Error::argument("index", index, format!("below {}", self.entries.len())));
@@ -117,7 +127,8 @@ pub enum DepthFile {
 
 /// Writes a frame into the layout of [`FolderDataset`], making the folders where needed.
 ///
-/// Fails with [`Error::Io`] or [`Error::Format`] naming the file, and with [`Error::Argument`] for a name with a path separator.
+/// Fails with [`Error::Io`] or [`Error::Format`] naming the file, and with [`Error::Argument`] for a name with a path
+/// separator.
 pub fn write_frame(dir: impl AsRef<Path>, name: &str, frame: &RgbdFrame, store: DepthFile) -> Result<()> {
     if name.is_empty() || name.contains(['/', '\\']) {
         return Err(Error::argument("name", format!("{name:?}"), "a file name without separators"));
@@ -212,7 +223,8 @@ mod tests {
         let scale = DepthScale::millimetres();
         let says = |needle: &str| {
             let set = FolderDataset::open(dir.path(), scale);
-            let error = set.and_then(|s| (0..s.len()).try_for_each(|i| s.load(i).map(drop))).unwrap_err().to_string();
+            let error =
+                set.and_then(|s| (0..s.len()).try_for_each(|i| s.load(i).map(drop))).unwrap_err().to_string();
             assert!(error.contains(needle), "{error}");
         };
         says("rgb");
@@ -228,7 +240,10 @@ mod tests {
         fs::remove_file(dir.path().join("gt/two.npy")).unwrap();
         fs::write(dir.path().join("rgb/one.png"), b"not a picture").unwrap();
         says("one.png");
-        assert!(matches!(write_frame(dir.path(), "../x", &frame, DepthFile::Npy), Err(Error::Argument { .. })));
+        assert!(matches!(
+            write_frame(dir.path(), "../x", &frame, DepthFile::Npy),
+            Err(Error::Argument { .. })
+        ));
     }
 
     #[test]

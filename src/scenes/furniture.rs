@@ -1,6 +1,8 @@
 //! Things that stand in rooms, built from solids, and clutter for the surfaces that they offer.
 
-use super::space::{UPRIGHT, V3};
+use std::f32::consts::{FRAC_PI_2, TAU};
+
+use super::space::{UPRIGHT, V3, mix, mul};
 use super::stage::{Paint, Place, Stage};
 use super::texture::Pattern;
 
@@ -41,7 +43,11 @@ impl Stage {
                     self.cuboid(place, [sx * x, under, sz * z], [r, under, r], leg);
                 }
                 if self.chance(0.5) {
-                    self.drawers(&place.inner([0.6 * half[0], 0.0, 0.0], 0.0), [0.3 * half[0], 0.8 * half[1]], 1.6 * under);
+                    self.drawers(
+                        &place.inner([0.6 * half[0], 0.0, 0.0], 0.0),
+                        [0.3 * half[0], 0.8 * half[1]],
+                        1.6 * under,
+                    );
                 }
             }
         }
@@ -62,7 +68,12 @@ impl Stage {
                 let x = (2 * i + 1) as f32 * cell[0] - half[0];
                 let y = (2 * j + 1) as f32 * cell[1];
                 self.cuboid(place, [x, y, -half[1]], [0.96 * cell[0], 0.96 * cell[1], 0.008], front);
-                self.cuboid(place, [x, y + 0.5 * cell[1], -half[1] - 0.02], [0.3 * cell[0].min(0.3), 0.006, 0.012], handle);
+                self.cuboid(
+                    place,
+                    [x, y + 0.5 * cell[1], -half[1] - 0.02],
+                    [0.3 * cell[0].min(0.3), 0.006, 0.012],
+                    handle,
+                );
             }
         }
         Top { place: place.inner([0.0, height, 0.0], 0.0), half }
@@ -113,7 +124,11 @@ impl Stage {
 
     pub fn chair(&mut self, place: &Place) {
         let (cloth, dark) = (self.vivid(), [self.real(0.02, 0.3); 3]);
-        let seat = if self.chance(0.3) { self.wood() } else { self.paint(Pattern::Cloud, cloth, super::space::mul(cloth, 0.7), 0.02) };
+        let seat = if self.chance(0.3) {
+            self.wood()
+        } else {
+            self.paint(Pattern::Cloud, cloth, mul(cloth, 0.7), 0.02)
+        };
         let frame = self.plain(dark);
         let (w, d, h) = (self.real(0.19, 0.27), self.real(0.19, 0.26), self.real(0.4, 0.5));
         let soft = self.chance(0.5);
@@ -151,7 +166,7 @@ impl Stage {
 
     pub fn sofa(&mut self, place: &Place) {
         let (a, b) = (self.vivid(), self.calm());
-        let cloth = self.paint(Pattern::Cloud, a, super::space::mix(a, b, 0.3), 0.05);
+        let cloth = self.paint(Pattern::Cloud, a, mix(a, b, 0.3), 0.05);
         let w = self.real(0.4, 1.1);
         self.cuboid(place, [0.0, 0.2, 0.0], [w, 0.2, 0.42], cloth);
         self.ball(place, [0.0, 0.42, -0.05], [w, 0.1, 0.42], cloth);
@@ -173,7 +188,8 @@ impl Stage {
         let case_colour = [self.real(0.02, 0.5); 3];
         let case = self.plain(case_colour);
         let (a, b) = (self.vivid(), self.vivid());
-        let screen = if self.chance(0.5) { self.plain([0.02; 3]) } else { self.paint(Pattern::Print, a, b, 0.3) };
+        let screen =
+            if self.chance(0.5) { self.plain([0.02; 3]) } else { self.paint(Pattern::Print, a, b, 0.3) };
         self.materials[screen as usize].glow = self.real(0.0, 0.8);
         self.materials[screen as usize].gloss = 0.2;
         self.cuboid(place, [0.0, y, 0.0], [w, h, 0.02], case);
@@ -185,7 +201,7 @@ impl Stage {
     pub fn keyboard(&mut self, place: &Place) {
         let (a, b) = ([self.real(0.02, 0.8); 3], [self.real(0.02, 0.8); 3]);
         let body = self.plain(a);
-        let keys = self.paint(Pattern::Tile, b, super::space::mul(a, 0.5), 0.019);
+        let keys = self.paint(Pattern::Tile, b, mul(a, 0.5), 0.019);
         self.cuboid(place, [0.0, 0.008, 0.0], [0.22, 0.008, 0.07], body);
         self.cuboid(place, [0.0, 0.014, 0.0], [0.21, 0.005, 0.06], keys);
         self.ball(place, [0.3, 0.012, 0.0], [0.03, 0.018, 0.05], body);
@@ -206,11 +222,11 @@ impl Stage {
         let c = self.calm();
         let pot = self.plain(c);
         let green = [self.real(0.03, 0.25), self.real(0.2, 0.5), self.real(0.02, 0.15)];
-        let leaf = self.paint(Pattern::Leaves, super::space::mul(green, 0.35), green, 0.12 * size);
+        let leaf = self.paint(Pattern::Leaves, mul(green, 0.35), green, 0.12 * size);
         self.tube(place, [0.0, 0.15 * size, 0.0], 0.13 * size, 0.15 * size, 1.3, pot);
         let count = self.int(6, 16);
         for _ in 0..count {
-            let (yaw, pitch) = (self.real(0.0, 6.28), self.real(0.2, 1.4));
+            let (yaw, pitch) = (self.real(0.0, TAU), self.real(0.2, 1.4));
             let long = size * self.real(0.15, 0.4);
             let twig = place.tilted([0.0, 0.3 * size, 0.0], yaw, pitch, 0.0);
             self.ball(&twig, [0.0, 0.0, long], [0.25 * long, 0.04 * long, long], leaf);
@@ -221,7 +237,7 @@ impl Stage {
         let (a, b) = (self.vivid(), self.vivid());
         let (shirt, legs) = (self.thing(0.4), self.plain(b));
         let skin = [self.real(0.25, 0.85), self.real(0.2, 0.6), self.real(0.15, 0.5)];
-        let (skin, hair) = (self.plain(skin), self.plain(super::space::mul(a, 0.2)));
+        let (skin, hair) = (self.plain(skin), self.plain(mul(a, 0.2)));
         let h = self.real(0.85, 1.1);
         let stride = self.real(-0.3, 0.3);
         for s in [-1.0, 1.0] {
@@ -240,7 +256,7 @@ impl Stage {
     pub fn clutter(&mut self, top: &Top, count: usize, size: f32) {
         for _ in 0..count {
             let (x, z) = (self.real(-0.95, 0.95) * top.half[0], self.real(-0.95, 0.95) * top.half[1]);
-            let yaw = self.real(0.0, 6.28);
+            let yaw = self.real(0.0, TAU);
             let s = size * self.log(0.35, 1.6);
             let place = top.place.inner([x, 0.0, z], yaw);
             self.object(&place, s);
@@ -272,7 +288,7 @@ impl Stage {
             }
             9 => self.books(place, s),
             10 => {
-                let lying = place.tilted([0.0, 0.25 * s, 0.0], 0.0, 0.0, std::f32::consts::FRAC_PI_2);
+                let lying = place.tilted([0.0, 0.25 * s, 0.0], 0.0, 0.0, FRAC_PI_2);
                 let taper = self.real(0.5, 1.0);
                 let long = s * self.pick(&[0.4, 0.8]);
                 self.tube(&lying, [0.0; 3], 0.25 * s, long, taper, m);
@@ -284,7 +300,7 @@ impl Stage {
             12 => {
                 let normal = [self.real(-1.0, 1.0), self.real(0.2, 1.0), self.real(-0.3, 0.3)];
                 let half = [0.5 * s, 0.4 * s, 0.4 * s];
-                self.cut(place, [0.0, 0.4 * s, 0.0], half, normal, self_offset(normal), m);
+                self.cut(place, [0.0, 0.4 * s, 0.0], half, normal, corner_offset(normal), m);
             }
             13 => {
                 // A curved thing: fruit, tool handle.
@@ -381,7 +397,7 @@ impl Stage {
 
     /// Solids of any kind, size and attitude, in the air.
     pub fn anything(&mut self, at: V3, size: f32) {
-        let (yaw, pitch, roll) = (self.real(0.0, 6.28), self.real(-1.5, 1.5), self.real(-3.1, 3.1));
+        let (yaw, pitch, roll) = (self.real(0.0, TAU), self.real(-1.5, 1.5), self.real(-3.1, 3.1));
         let place = Place { at, axes: UPRIGHT }.tilted([0.0; 3], yaw, pitch, roll);
         let m = if self.chance(0.5) { self.surface(size) } else { self.thing(size) };
         let half = [size * self.log(0.05, 1.0), size * self.log(0.1, 1.0), size * self.log(0.1, 1.0)];
@@ -394,13 +410,13 @@ impl Stage {
             }
             _ => {
                 let n = [self.real(-1.0, 1.0), self.real(-1.0, 1.0), self.real(-1.0, 1.0)];
-                self.cut(&place, [0.0; 3], half, n, 0.4 * self_offset(n), m);
+                self.cut(&place, [0.0; 3], half, n, 0.4 * corner_offset(n), m);
             }
         }
     }
 }
 
 /// An offset at which a plane of this normal cuts a corner off the unit cube.
-fn self_offset(n: V3) -> f32 {
+fn corner_offset(n: V3) -> f32 {
     0.35 * (n[0].abs() + n[1].abs() + n[2].abs())
 }

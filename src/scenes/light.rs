@@ -114,7 +114,7 @@ pub(super) fn shade(stage: &mut Stage, hits: &Hits, width: usize) -> Vec<V3> {
         }
         let glow = [material.glow; 3];
         let c = add(times(albedo, add(light, glow)), shine);
-        let veil = 1.0 - (-t / stage.haze).exp();
+        let veil = if stage.haze < f32::INFINITY { 1.0 - (-t / stage.haze).exp() } else { 0.0 };
         out.push(mix(c, stage.sky[0], veil));
     }
     occlude(&mut out, hits, width);
@@ -137,7 +137,11 @@ fn occlude(colour: &mut [V3], hits: &Hits, width: usize) {
                 continue;
             }
             let mut dark = 0.0;
-            for (a, b) in [(i - step, i + step), (i - step * width, i + step * width), (i - step * width / 2, i + step * width / 2)] {
+            for (a, b) in [
+                (i - step, i + step),
+                (i - step * width, i + step * width),
+                (i - step * width / 2, i + step * width / 2),
+            ] {
                 let (a, b) = (hits.depth[a], hits.depth[b]);
                 if a == f32::INFINITY || b == f32::INFINITY {
                     continue;
@@ -190,7 +194,7 @@ pub(super) fn develop(stage: &mut Stage, mut colour: Vec<V3>, width: usize, heig
     let cast = mul(cast, gain);
     let vignette = if stage.chance(0.5) { stage.real(0.0, 0.5) } else { 0.0 };
     let blur = if stage.chance(0.6) { stage.real(0.0, 0.22) } else { 0.0 };
-    let noise = if stage.chance(0.7) { stage.log(0.003, 0.045) } else { 0.0 };
+    let noise = if stage.chance(0.7) { stage.log(0.002, 0.035) } else { 0.0 };
     let saturation = stage.real(0.6, 1.25);
     let gamma = 1.0 / stage.real(1.8, 2.5);
     let contrast = stage.real(0.0, 0.8);
@@ -225,7 +229,8 @@ pub(super) fn develop(stage: &mut Stage, mut colour: Vec<V3>, width: usize, heig
             bytes.push((out + 0.5) as u8);
         }
     }
-    RgbImage::from_raw(width as u32, height as u32, bytes).unwrap_or_else(|| RgbImage::new(width as u32, height as u32))
+    RgbImage::from_raw(width as u32, height as u32, bytes)
+        .unwrap_or_else(|| RgbImage::new(width as u32, height as u32))
 }
 
 /// Separable 3-tap blur with weight `w` for each neighbour.

@@ -83,7 +83,7 @@ fn attempt(rng: &mut ChaCha8Rng, width: usize, height: usize) -> (Stage, cast::H
     let own = ChaCha8Rng::seed_from_u64(rng.next_u64());
     let start = camera::Camera::new(Intrinsics::from_fov(width, height, 1.0), [0.0; 3], 0.0, 0.0, 0.0);
     let mut stage = Stage::new(own, start);
-    let mut k = Intrinsics::from_fov(width, height, stage.real(0.7, 1.57));
+    let mut k = Intrinsics::from_fov(width, height, stage.real(0.7, std::f32::consts::FRAC_PI_2));
     k.cx += stage.real(-0.04, 0.04) * width as f32;
     k.cy += stage.real(-0.04, 0.04) * height as f32;
     match stage.int(0, 99) {

@@ -44,9 +44,10 @@ impl FromStr for SparsePattern {
 impl SparsePattern {
     /// Chooses `points` distinct valid pixels (all of them when there are fewer) and keeps their depth bit for bit.
     ///
-    /// `depth` is row-major `width * height` metres; values that are not finite and positive are never chosen. Fails with
-    /// [`Error::BufferLength`] or [`Error::SizeMismatch`] when sizes disagree, [`Error::Argument`] for zero points or zero lines, and
-    /// [`Error::NoMeasurement`] when no pixel is valid.
+    /// `depth` is row-major `width * height` metres; values that are not finite and positive are never chosen.
+    ///
+    /// Fails with [`Error::BufferLength`] or [`Error::SizeMismatch`] when sizes disagree, [`Error::Argument`] for zero
+    /// points or zero lines, and [`Error::NoMeasurement`] when no pixel is valid.
     pub fn sample(
         &self,
         rgb: &RgbImage,
@@ -81,7 +82,8 @@ impl SparsePattern {
     }
 }
 
-/// `n` distinct valid pixels (all when there are fewer), each set equally likely, the same for the same seed on every platform.
+/// `n` distinct valid pixels (all when there are fewer), each set equally likely; the same for the same seed on every
+/// platform.
 ///
 /// Fails as [`SparsePattern::sample`] does.
 pub fn sample_points(depth: &[f32], width: usize, height: usize, n: usize, seed: u64) -> Result<SparseDepth> {
@@ -181,7 +183,8 @@ impl Scan {
 /// Gradient strength times a coarse random cover: real reconstructions have dense and empty regions.
 fn feature_weights(rgb: &RgbImage, rng: &mut impl Rng) -> Vec<f32> {
     let (w, h) = (rgb.width() as usize, rgb.height() as usize);
-    let grey: Vec<f32> = rgb.pixels().map(|p| p.0.iter().map(|&c| f32::from(c)).sum::<f32>() / 765.0).collect();
+    let grey: Vec<f32> =
+        rgb.pixels().map(|p| p.0.iter().map(|&c| f32::from(c)).sum::<f32>() / 765.0).collect();
     let seed: u32 = rng.random();
     let cell = 0.18 * w.max(h) as f32 + 1.0;
     let mut out = Vec::with_capacity(w * h);
@@ -202,8 +205,12 @@ mod tests {
     use super::*;
     use crate::scenes::procedural;
 
-    const PATTERNS: [SparsePattern; 4] =
-        [SparsePattern::Uniform, SparsePattern::Lidar { lines: 16 }, SparsePattern::Lidar { lines: 64 }, SparsePattern::Sfm];
+    const PATTERNS: [SparsePattern; 4] = [
+        SparsePattern::Uniform,
+        SparsePattern::Lidar { lines: 16 },
+        SparsePattern::Lidar { lines: 64 },
+        SparsePattern::Sfm,
+    ];
 
     #[test]
     fn as_many_exact_points_as_asked() {
@@ -247,7 +254,8 @@ mod tests {
         let mut rng = ChaCha8Rng::seed_from_u64(3);
         let spread = |pattern: SparsePattern, rng: &mut ChaCha8Rng| {
             let sparse = pattern.sample(&rgb, &depth, 200, 150, 400, rng).unwrap();
-            let mut rows: Vec<usize> = sparse.points().filter(|p| (90..110).contains(&p.0)).map(|p| p.1).collect();
+            let mut rows: Vec<usize> =
+                sparse.points().filter(|p| (90..110).contains(&p.0)).map(|p| p.1).collect();
             rows.sort_unstable();
             rows.dedup();
             rows.len()
@@ -271,8 +279,14 @@ mod tests {
         let depth: Vec<f32> = (0..100).map(|i| 1.0 + i as f32).collect();
         let chosen: Vec<f32> = sample_points(&depth, 10, 10, 5, 7).unwrap().points().map(|p| p.2).collect();
         assert_eq!(chosen.len(), 5);
-        assert_eq!(chosen, sample_points(&depth, 10, 10, 5, 7).unwrap().points().map(|p| p.2).collect::<Vec<_>>());
-        assert_ne!(chosen, sample_points(&depth, 10, 10, 5, 8).unwrap().points().map(|p| p.2).collect::<Vec<_>>());
+        assert_eq!(
+            chosen,
+            sample_points(&depth, 10, 10, 5, 7).unwrap().points().map(|p| p.2).collect::<Vec<_>>()
+        );
+        assert_ne!(
+            chosen,
+            sample_points(&depth, 10, 10, 5, 8).unwrap().points().map(|p| p.2).collect::<Vec<_>>()
+        );
     }
 
     #[test]

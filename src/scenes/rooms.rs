@@ -1,5 +1,7 @@
 //! Indoor scenes: furnished rooms, desks, table tops, halls, and solids in free arrangement.
 
+use std::f32::consts::{FRAC_PI_2, TAU};
+
 use super::camera::{Camera, Intrinsics};
 use super::furniture::Top;
 use super::space::{V3, mul};
@@ -15,14 +17,21 @@ impl Stage {
         let d = super::space::sub(target, at);
         let yaw = d[0].atan2(d[2]) + disorder * self.real(-0.5, 0.5);
         let pitch = d[1].atan2((d[0] * d[0] + d[2] * d[2]).sqrt()) + disorder * self.real(-0.3, 0.3);
-        let roll = if self.chance(0.7) { self.real(-0.06, 0.06) } else { self.real(-0.5, 0.5) * disorder.min(1.0) };
+        let roll =
+            if self.chance(0.7) { self.real(-0.06, 0.06) } else { self.real(-0.5, 0.5) * disorder.min(1.0) };
         self.camera = Camera::new(k, at, yaw, pitch, roll);
     }
 
     fn indoor_light(&mut self, size: Size) {
-        self.ambient = mul([1.0, self.real(0.9, 1.05), self.real(0.75, 1.15)], self.real(0.15, 0.6));
+        // Some rooms are dark but for what stands near a lamp.
+        let level = if self.chance(0.15) { self.real(0.02, 0.1) } else { self.real(0.15, 0.6) };
+        self.ambient = mul([1.0, self.real(0.9, 1.05), self.real(0.75, 1.15)], level);
         for _ in 0..self.int(1, 3) {
-            let at = [self.real(-0.9, 0.9) * size[0], self.real(0.75, 0.97) * size[1], self.real(-0.9, 0.9) * size[2]];
+            let at = [
+                self.real(-0.9, 0.9) * size[0],
+                self.real(0.75, 0.97) * size[1],
+                self.real(-0.9, 0.9) * size[2],
+            ];
             let (strength, reach) = (self.real(0.3, 1.2), size[1] * self.real(0.5, 2.5));
             self.lamp(at, strength, reach);
         }
@@ -37,10 +46,21 @@ impl Stage {
         let half = 0.5 * length;
         if open {
             let (w, c) = (self.real(0.4, 0.9).min(0.4 * half), self.real(-0.5, 0.5) * half);
-            let (y0, y1) = if self.chance(0.6) { (0.0, 0.8 * height) } else { (0.35 * height, 0.85 * height) };
-            for (a, b, low, high) in [(-half, c - w, 0.0, height), (c + w, half, 0.0, height), (c - w, c + w, 0.0, y0), (c - w, c + w, y1, height)] {
+            let (y0, y1) =
+                if self.chance(0.6) { (0.0, 0.8 * height) } else { (0.35 * height, 0.85 * height) };
+            for (a, b, low, high) in [
+                (-half, c - w, 0.0, height),
+                (c + w, half, 0.0, height),
+                (c - w, c + w, 0.0, y0),
+                (c - w, c + w, y1, height),
+            ] {
                 if b - a > 0.01 && high - low > 0.01 {
-                    self.cuboid(&place, [0.5 * (a + b), 0.5 * (low + high), t], [0.5 * (b - a), 0.5 * (high - low), t], m);
+                    self.cuboid(
+                        &place,
+                        [0.5 * (a + b), 0.5 * (low + high), t],
+                        [0.5 * (b - a), 0.5 * (high - low), t],
+                        m,
+                    );
                 }
             }
             let frame = self.wood();
@@ -93,7 +113,11 @@ impl Stage {
         let [w, h, l] = size;
         let world = self.world();
         let (floor, ceiling, wall) = (self.floor(), self.calm(), self.surface(2.0));
-        let ceiling = if self.chance(0.3) { self.paint(Pattern::Tile, ceiling, mul(ceiling, 0.7), 0.6) } else { self.plain(ceiling) };
+        let ceiling = if self.chance(0.3) {
+            self.paint(Pattern::Tile, ceiling, mul(ceiling, 0.7), 0.6)
+        } else {
+            self.plain(ceiling)
+        };
         let far = 3.0 * w.max(l);
         self.cuboid(&world, [0.0, -0.1, 0.0], [far, 0.1, far], floor);
         self.cuboid(&world, [0.0, h + 0.1, 0.0], [far, 0.1, far], ceiling);
@@ -110,7 +134,7 @@ impl Stage {
             self.cuboid(&world, [reach * x, 0.0, reach * z], half, back);
         }
         for _ in 0..self.int(0, 5) {
-            let (a, r) = (self.real(0.0, 6.28), self.real(0.5, 0.9) * far);
+            let (a, r) = (self.real(0.0, TAU), self.real(0.5, 0.9) * far);
             let place = Place::new([r * a.sin(), 0.0, r * a.cos()], a);
             if place.at[0].abs() > w + 0.6 || place.at[2].abs() > l + 0.6 {
                 self.furnish(&place);
@@ -193,13 +217,13 @@ impl Stage {
             let depth = self.real(0.25, 0.5);
             let place = match i % 4 {
                 0 | 2 => Place::new([along * w, 0.0, l - depth], 0.0),
-                1 => Place::new([w - depth, 0.0, along * l], std::f32::consts::FRAC_PI_2),
-                _ => Place::new([depth - w, 0.0, along * l], -std::f32::consts::FRAC_PI_2),
+                1 => Place::new([w - depth, 0.0, along * l], FRAC_PI_2),
+                _ => Place::new([depth - w, 0.0, along * l], -FRAC_PI_2),
             };
             self.furnish(&place);
         }
         for _ in 0..self.int(1, 4) {
-            let yaw = self.real(0.0, 6.28);
+            let yaw = self.real(0.0, TAU);
             let at = [self.real(-0.6, 0.6) * w, 0.0, self.real(-0.3, 0.7) * l];
             self.furnish(&Place::new(at, yaw));
         }
@@ -236,10 +260,10 @@ impl Stage {
             let x = self.real(-0.8, 0.8) * half[0];
             self.desk_lamp(&top.place.inner([x, 0.0, 0.0], 0.7));
         }
-        let (n, s) = (self.int(4, 22), self.log(0.06, 0.22));
+        let (n, s) = (self.int(4, 26), self.log(0.09, 0.26));
         self.clutter(&top, n, s);
         for _ in 0..self.int(0, 2) {
-            let (x, turn) = (self.real(-0.8, 0.8) * half[0], self.real(0.0, 6.28));
+            let (x, turn) = (self.real(-0.8, 0.8) * half[0], self.real(0.0, TAU));
             let gap = self.pick(&[0.2, 0.4]);
             self.chair(&place.inner([x, 0.0, -half[1] - gap], turn));
         }
@@ -249,7 +273,11 @@ impl Stage {
         }
         self.indoor_light(size);
         let around = yaw + self.real(-0.8, 0.8);
-        let at = [-distance * around.sin(), height + self.real(0.15, 0.8), 0.3 - (distance + half[1]) * around.cos()];
+        let at = [
+            -distance * around.sin(),
+            height + self.real(0.15, 0.8),
+            0.3 - (distance + half[1]) * around.cos(),
+        ];
         let target = [self.real(-0.3, 0.3), height + self.real(-0.3, 0.25), 0.3];
         self.aim(k, at, target, 0.3);
         self.focus = ([0.0, 0.7, 0.3], 1.6);
@@ -260,13 +288,9 @@ impl Stage {
         let size = [self.real(0.8, 3.0), self.real(1.8, 3.0), self.real(0.8, 3.0)];
         self.shell(size);
         let half = [self.log(0.25, 0.9), self.log(0.25, 0.7)];
-        let (height, yaw) = (self.real(0.0, 0.9), self.real(0.0, 6.28));
+        let (height, yaw) = (self.real(0.0, 0.9), self.real(0.0, TAU));
         let place = Place::new([0.0; 3], yaw);
-        let top = if height < 0.35 {
-            Top { place, half }
-        } else {
-            self.table(&place, half, height)
-        };
+        let top = if height < 0.35 { Top { place, half } } else { self.table(&place, half, height) };
         if self.chance(0.3) {
             // A cloth, a board or a tray.
             let m = self.floor();
@@ -275,17 +299,19 @@ impl Stage {
         if self.chance(0.25) {
             self.bin(&top);
         }
-        let (n, s) = (self.int(5, 38), self.log(0.04, 0.2));
-        let inner = Top { place: top.place, half: mul([half[0], half[1], 0.0], 0.8)[..2].try_into().unwrap_or(half) };
+        let r = self.log(0.35, 1.4);
+        // Things are large in the picture, as in close-ups, and crowd where there are many.
+        let (n, s) = (self.int(4, 40), r * self.log(0.08, 0.3));
+        let inner = Top { place: top.place, half: [0.8 * half[0], 0.8 * half[1]] };
         self.clutter(&inner, n, s);
         for _ in 0..self.int(0, 4) {
-            let (a, r) = (self.real(0.0, 6.28), self.real(1.1, 2.0));
+            let (a, r) = (self.real(0.0, TAU), self.real(1.1, 2.0));
             let at = [r * a.sin(), 0.0, r * a.cos()];
             self.furnish(&Place::new(at, a));
         }
         self.indoor_light(size);
         let base = top.place.at[1];
-        let (a, e, r) = (self.real(0.0, 6.28), self.real(0.15, 1.45), self.log(0.35, 1.4));
+        let (a, e) = (self.real(0.0, TAU), self.real(0.15, 1.45));
         let at = [r * e.cos() * a.sin(), base + (r * e.sin()).max(0.08), r * e.cos() * a.cos()];
         let target = [self.real(-0.3, 0.3) * half[0], base + 0.03, self.real(-0.3, 0.3) * half[1]];
         self.aim(k, at, target, 0.25);
@@ -347,7 +373,7 @@ impl Stage {
         for _ in 0..self.int(2, 10) {
             let side = self.pick(&[-1.0f32, 1.0]);
             let at = [side * (w - 0.4) * self.real(0.6, 1.0), 0.0, self.real(-0.5, 0.9) * l];
-            self.furnish(&Place::new(at, side * std::f32::consts::FRAC_PI_2));
+            self.furnish(&Place::new(at, side * FRAC_PI_2));
         }
         self.indoor_light(size);
         let at = [self.real(-0.6, 0.6) * w, self.real(0.8, 1.9).min(0.8 * h), self.real(-0.9, -0.2) * l];

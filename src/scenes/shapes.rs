@@ -13,9 +13,14 @@ pub(super) enum Kind {
     Cuboid,
     Ellipsoid,
     /// Axis y, radius 1 at y = -1 and `top` at y = +1, closed by discs.
-    Frustum { top: f32 },
+    Frustum {
+        top: f32,
+    },
     /// The cuboid's part where `dot(normal, p) <= offset`.
-    Cut { normal: V3, offset: f32 },
+    Cut {
+        normal: V3,
+        offset: f32,
+    },
 }
 
 #[derive(Clone, Debug)]
@@ -54,7 +59,13 @@ impl Solid {
 #[inline(always)]
 fn face(p: V3) -> (V3, f32) {
     let a = [p[0].abs(), p[1].abs(), p[2].abs()];
-    let k = if a[0] >= a[1] && a[0] >= a[2] { 0 } else if a[1] >= a[2] { 1 } else { 2 };
+    let k = if a[0] >= a[1] && a[0] >= a[2] {
+        0
+    } else if a[1] >= a[2] {
+        1
+    } else {
+        2
+    };
     let mut n = [0.0; 3];
     n[k] = p[k].signum();
     (n, (1.0 - a[k]).abs())

@@ -5,7 +5,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::camera::Camera;
 use super::shapes::{Kind, Solid};
-use super::space::{Rot, UPRIGHT, V3, add, compose, mix, mul, to_world, turned};
+use super::space::{Rot, UPRIGHT, V3, add, compose, dot, mix, mul, norm, sub, to_world, turned, unit};
 use super::texture::{Material, Pattern};
 
 /// A light at a point; a sun is a light very far away without fall-off.
@@ -146,7 +146,7 @@ impl Stage {
     }
 
     pub fn paint(&mut self, pattern: Pattern, base: V3, second: V3, period: f32) -> Paint {
-        let grain = if self.chance(0.6) { self.real(0.02, 0.25) } else { 0.0 };
+        let grain = if self.chance(0.4) { self.log(0.02, 0.25) } else { 0.0 };
         let m = Material {
             pattern,
             base,
@@ -234,7 +234,15 @@ impl Stage {
     }
 
     /// Upright; `top` is the upper radius relative to the lower one.
-    pub fn tube(&mut self, place: &Place, centre: V3, radius: f32, half_height: f32, top: f32, material: Paint) {
+    pub fn tube(
+        &mut self,
+        place: &Place,
+        centre: V3,
+        radius: f32,
+        half_height: f32,
+        top: f32,
+        material: Paint,
+    ) {
         self.put(Kind::Frustum { top }, place, centre, [radius, half_height, radius], material);
     }
 
@@ -245,11 +253,11 @@ impl Stage {
 
     /// A round bar between two local points.
     pub fn bar(&mut self, place: &Place, from: V3, to: V3, radius: f32, material: Paint) {
-        let d = [to[0] - from[0], to[1] - from[1], to[2] - from[2]];
-        let length = super::space::norm(d).max(1e-6);
+        let d = sub(to, from);
+        let length = norm(d).max(1e-6);
         let y = mul(d, 1.0 / length);
-        let x = if y[1].abs() < 0.9 { super::space::unit([y[2], 0.0, -y[0]]) } else { [1.0, 0.0, 0.0] };
-        let x = super::space::unit(super::space::sub(x, mul(y, super::space::dot(x, y))));
+        let x = if y[1].abs() < 0.9 { unit([y[2], 0.0, -y[0]]) } else { [1.0, 0.0, 0.0] };
+        let x = unit(sub(x, mul(y, dot(x, y))));
         let z = [y[1] * x[2] - y[2] * x[1], y[2] * x[0] - y[0] * x[2], y[0] * x[1] - y[1] * x[0]];
         let inner = Place { at: place.point(mix(from, to, 0.5)), axes: compose(&[x, y, z], &place.axes) };
         self.tube(&inner, [0.0; 3], radius, 0.5 * length, 1.0, material);

@@ -1,5 +1,7 @@
 //! Outdoor scenes: streets and open places, under a sky without return.
 
+use std::f32::consts::{FRAC_PI_2, PI, TAU};
+
 use super::camera::Intrinsics;
 use super::space::{V3, mix, mul, unit};
 use super::stage::{Paint, Place, Stage};
@@ -7,7 +9,7 @@ use super::texture::Pattern;
 
 impl Stage {
     fn daylight(&mut self) {
-        let (a, e) = (self.real(0.0, 6.28), self.real(0.25, 1.3));
+        let (a, e) = (self.real(0.0, TAU), self.real(0.25, 1.3));
         let to: V3 = [e.cos() * a.sin(), e.sin(), e.cos() * a.cos()];
         let overcast = self.chance(0.35);
         let sun = if overcast { self.real(0.0, 0.3) } else { self.real(0.7, 1.6) };
@@ -15,7 +17,11 @@ impl Stage {
         let blue = self.real(0.9, 1.3);
         self.ambient = mul([0.95, 1.0, blue], self.real(0.3, 0.7));
         let grey = self.real(0.5, 1.0);
-        self.sky = if overcast { [[grey, grey, grey]; 2] } else { [mix([grey; 3], [0.6, 0.8, 1.0], 0.4), [0.25, 0.45, self.real(0.7, 1.1)]] };
+        self.sky = if overcast {
+            [[grey, grey, grey]; 2]
+        } else {
+            [mix([grey; 3], [0.6, 0.8, 1.0], 0.4), [0.25, 0.45, self.real(0.7, 1.1)]]
+        };
         if self.chance(0.5) {
             self.haze = self.log(80.0, 800.0);
         }
@@ -23,7 +29,8 @@ impl Stage {
 
     fn building(&mut self, place: &Place, half: V3) {
         let (a, b) = (self.calm(), [self.real(0.03, 0.3); 3]);
-        let pattern = self.pick(&[Pattern::Window, Pattern::Window, Pattern::Brick, Pattern::Plain, Pattern::Stripe]);
+        let pattern =
+            self.pick(&[Pattern::Window, Pattern::Window, Pattern::Brick, Pattern::Plain, Pattern::Stripe]);
         let period = if pattern == Pattern::Window { self.real(2.0, 4.0) } else { self.real(0.3, 1.5) };
         let m = self.paint(pattern, a, b, period);
         self.cuboid(place, [0.0, half[1], 0.0], half, m);
@@ -45,7 +52,12 @@ impl Stage {
                 let m = self.plain(c);
                 for k in 1..((half[1] / 1.5) as usize).min(8) {
                     self.cuboid(place, [0.0, 3.0 * k as f32, 0.0], [half[0] + 0.8, 0.1, 0.8 * half[2]], m);
-                    self.cuboid(place, [0.0, 3.0 * k as f32 + 0.5, 0.0], [half[0] + 0.8, 0.5, 0.78 * half[2]], m);
+                    self.cuboid(
+                        place,
+                        [0.0, 3.0 * k as f32 + 0.5, 0.0],
+                        [half[0] + 0.8, 0.5, 0.78 * half[2]],
+                        m,
+                    );
                 }
             }
             3 => {
@@ -71,7 +83,7 @@ impl Stage {
         self.cut(place, cabin, [0.9 * w, tall, 0.6 * l], [0.0, 0.8, 1.0], 1.2, glass);
         self.cuboid(place, [0.0, cabin[1] + tall, -0.2 * l], [0.85 * w, 0.03, 0.35 * l], body);
         for (sx, sz) in [(1.0, 1.0), (-1.0, 1.0), (1.0, -1.0), (-1.0, -1.0)] {
-            let wheel = place.tilted([sx * w, 0.32, sz * 0.62 * l], 0.0, 0.0, std::f32::consts::FRAC_PI_2);
+            let wheel = place.tilted([sx * w, 0.32, sz * 0.62 * l], 0.0, 0.0, FRAC_PI_2);
             self.tube(&wheel, [0.0; 3], 0.32, 0.11, 1.0, tyre);
         }
         let (red, plate) = (self.plain([0.7, 0.03, 0.03]), self.plain([0.8; 3]));
@@ -90,7 +102,7 @@ impl Stage {
         self.cuboid(place, [0.0, 1.8, l + 1.2], [1.15, 1.1, 0.9], cab);
         for s in [-1.0, 1.0] {
             for z in [-0.8 * l, -0.5 * l, l + 1.0] {
-                let wheel = place.tilted([s * 1.05, 0.5, z], 0.0, 0.0, std::f32::consts::FRAC_PI_2);
+                let wheel = place.tilted([s * 1.05, 0.5, z], 0.0, 0.0, FRAC_PI_2);
                 self.tube(&wheel, [0.0; 3], 0.5, 0.15, 1.0, tyre);
             }
         }
@@ -106,17 +118,24 @@ impl Stage {
         if self.chance(0.25) {
             for k in 0..3 {
                 let y = (0.45 + 0.2 * k as f32) * height;
-                self.tube(place, [0.0, y, 0.0], (0.28 - 0.06 * k as f32) * height, 0.17 * height, 0.0, leaves);
+                self.tube(
+                    place,
+                    [0.0, y, 0.0],
+                    (0.28 - 0.06 * k as f32) * height,
+                    0.17 * height,
+                    0.0,
+                    leaves,
+                );
             }
             return;
         }
         let bare = self.chance(0.15);
-        for _ in 0..self.int(5, 12) {
-            let (a, r) = (self.real(0.0, 6.28), self.real(0.0, 0.25) * height);
+        for _ in 0..self.int(7, 22) {
+            let (a, r) = (self.real(0.0, TAU), self.real(0.0, 0.25) * height);
             let p = [r * a.sin(), self.real(0.5, 0.9) * height, r * a.cos()];
             self.bar(place, [0.0, 0.42 * height, 0.0], p, 0.008 * height, trunk);
             if !bare {
-                let s = height * self.real(0.1, 0.2);
+                let s = height * self.real(0.06, 0.17);
                 let flat = self.pick(&[0.7, 0.9]);
                 self.ball(place, p, [s, s * flat, s], leaves);
             }
@@ -193,7 +212,7 @@ impl Stage {
             let row = self.real(5.0, 14.0);
             while z < 90.0 {
                 let x = s * (curb + self.real(0.4, 1.2));
-                let place = Place::new([x, 0.1, z], 1.57 - 1.57 * s);
+                let place = Place::new([x, 0.1, z], FRAC_PI_2 - FRAC_PI_2 * s);
                 if self.chance(trees) {
                     let tall = self.real(3.0, 11.0);
                     self.tree(&place, tall);
@@ -216,8 +235,10 @@ impl Stage {
         }
         for _ in 0..self.int(0, 5) {
             let lanes = (curb / lane) as i32;
-            let x = lane * (self.int(0, (2 * lanes).max(1) as usize) as f32 - lanes as f32 + 0.5).clamp(-curb / lane + 0.6, curb / lane - 0.6);
-            let turn = if x < 0.0 { std::f32::consts::PI } else { 0.0 };
+            let x = lane
+                * (self.int(0, (2 * lanes).max(1) as usize) as f32 - lanes as f32 + 0.5)
+                    .clamp(-curb / lane + 0.6, curb / lane - 0.6);
+            let turn = if x < 0.0 { PI } else { 0.0 };
             let z = self.log(7.0, 80.0);
             if self.chance(0.75) {
                 self.car(&Place::new([x, 0.0, z], turn));
@@ -261,19 +282,24 @@ impl Stage {
         for _ in 0..self.int(1, 5) {
             let (a, r) = (self.real(-1.3, 1.3), self.log(8.0, 45.0));
             let half = [self.real(2.0, 10.0), self.log(1.2, 8.0), self.real(2.0, 10.0)];
-            let yaw = self.real(0.0, 6.28);
+            let yaw = self.real(0.0, TAU);
             let r = r + half[0].max(half[2]) * 1.4;
             self.building(&Place::new([r * a.sin(), 0.0, r * a.cos()], yaw), half);
         }
         for _ in 0..self.int(0, 4) {
             let (a, r) = (self.real(-1.2, 1.2), self.log(3.0, 20.0));
             let wall = self.surface(1.5);
-            let (yaw, long, tall) = (self.real(0.0, 6.28), self.log(0.5, 6.0), self.log(0.2, 1.5));
-            self.cuboid(&Place::new([r * a.sin(), 0.0, r * a.cos()], yaw), [0.0, tall, 0.0], [long, tall, 0.15], wall);
+            let (yaw, long, tall) = (self.real(0.0, TAU), self.log(0.5, 6.0), self.log(0.2, 1.5));
+            self.cuboid(
+                &Place::new([r * a.sin(), 0.0, r * a.cos()], yaw),
+                [0.0, tall, 0.0],
+                [long, tall, 0.15],
+                wall,
+            );
         }
         for _ in 0..self.int(3, 18) {
             let (a, r) = (self.real(-1.1, 1.1), self.log(2.2, 40.0));
-            let yaw = self.real(0.0, 6.28);
+            let yaw = self.real(0.0, TAU);
             let place = Place::new([r * a.sin(), 0.0, r * a.cos()], yaw);
             match self.int(0, 9) {
                 0..=2 => {

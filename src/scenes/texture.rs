@@ -39,7 +39,9 @@ pub(super) struct Material {
 
 #[inline(always)]
 pub(super) fn hash(a: i32, b: i32, seed: u32) -> u32 {
-    let mut h = (a as u32).wrapping_mul(0x9E37_79B1) ^ (b as u32).wrapping_mul(0x85EB_CA77) ^ seed.wrapping_mul(0xC2B2_AE3D);
+    let mut h = (a as u32).wrapping_mul(0x9E37_79B1)
+        ^ (b as u32).wrapping_mul(0x85EB_CA77)
+        ^ seed.wrapping_mul(0xC2B2_AE3D);
     h = (h ^ (h >> 15)).wrapping_mul(0x2C1B_3C6D);
     h = (h ^ (h >> 12)).wrapping_mul(0x297A_2D39);
     h ^ (h >> 15)
@@ -50,12 +52,18 @@ fn hash01(a: i32, b: i32, seed: u32) -> f32 {
     (hash(a, b, seed) >> 8) as f32 * (1.0 / 16_777_216.0)
 }
 
+/// `floor` as an integer. Without SSE4.1, which the baseline x86-64 lacks, `f32::floor` is a call into libm.
+#[inline(always)]
+fn floor(x: f32) -> i32 {
+    let i = x as i32;
+    i.wrapping_sub(i32::from(x < i as f32))
+}
+
 /// Value noise in [0, 1] with smooth interpolation on the unit lattice.
 #[inline(always)]
 pub(super) fn noise(u: f32, v: f32, seed: u32) -> f32 {
-    let (fu, fv) = (u.floor(), v.floor());
-    let (i, j) = (fu as i32, fv as i32);
-    let (a, b) = (u - fu, v - fv);
+    let (i, j) = (floor(u), floor(v));
+    let (a, b) = (u - i as f32, v - j as f32);
     let (a, b) = (a * a * (3.0 - 2.0 * a), b * b * (3.0 - 2.0 * b));
     let low = hash01(i, j, seed) * (1.0 - a) + hash01(i.wrapping_add(1), j, seed) * a;
     let j = j.wrapping_add(1);
@@ -120,8 +128,8 @@ impl Material {
 
     fn colour(&self, uv: [f32; 2], st: [f32; 2], footprint: f32, solid: &Solid) -> V3 {
         let q = [uv[0] / self.period, uv[1] / self.period];
-        let (i, j) = (q[0].floor(), q[1].floor());
-        let (a, b) = (q[0] - i, q[1] - j);
+        let (i, j) = (floor(q[0]), floor(q[1]));
+        let (a, b) = (q[0] - i as f32, q[1] - j as f32);
         // Sharpness of the pattern at this distance: 1 near, 0 when a period is below about two pixels.
         let px = footprint / self.period;
         let keep = (1.3 - 2.0 * px).clamp(0.0, 1.0);
@@ -135,34 +143,35 @@ impl Material {
                 let t = 0.5 + 1.8 * octaves(uv[0], uv[1], self.period, footprint, self.seed ^ 7);
                 mix(self.base, self.second, t.clamp(0.0, 1.0))
             }
-            Pattern::Checker => two((i + j).rem_euclid(2.0) >= 1.0, 0.5),
+            Pattern::Checker => two(i.wrapping_add(j) & 1 == 1, 0.5),
             Pattern::Stripe => {
-                let t = hash01(i as i32, 0, self.seed);
+                let t = hash01(i, 0, self.seed);
                 let c = mix(self.base, self.second, t);
                 mix(mix(self.base, self.second, 0.5), c, keep)
             }
             Pattern::Tile => {
                 let line = (0.03f32).max(0.5 * px);
-                let tone = 0.15 * (hash01(i as i32, j as i32, self.seed) - 0.5) * keep;
+                let tone = 0.15 * (hash01(i, j, self.seed) - 0.5) * keep;
                 mul(two(a < line || b < line, 2.0 * line.min(0.5)), 1.0 + tone)
             }
             Pattern::Brick => {
-                let row = (2.0 * q[1]).floor();
-                let shift = q[0] + 0.5 * row.rem_euclid(2.0);
-                let (along, across) = (shift - shift.floor(), 2.0 * q[1] - row);
-                let tone = 0.35 * (hash01(shift.floor() as i32, row as i32, self.seed) - 0.5) * keep;
+                let row = floor(2.0 * q[1]);
+                let shift = q[0] + 0.5 * (row & 1) as f32;
+                let block = floor(shift);
+                let (along, across) = (shift - block as f32, 2.0 * q[1] - row as f32);
+                let tone = 0.35 * (hash01(block, row, self.seed) - 0.5) * keep;
                 mul(two(along < 0.05 || across < 0.1, 0.14), 1.0 + tone)
             }
             Pattern::Wood => {
-                let board = (q[1] * 0.5).floor();
-                let bend = 0.6 * noise(q[0] * 0.15, q[1] * 0.6 + 17.0 * board, self.seed);
+                let board = floor(q[1] * 0.5);
+                let bend = 0.6 * noise(q[0] * 0.15, q[1] * 0.6 + 17.0 * board as f32, self.seed);
                 let ring = noise(q[0] * 0.25, (q[1] + bend) * 6.0, self.seed ^ 3);
-                let tone = 0.25 * (hash01(board as i32, 1, self.seed) - 0.5);
+                let tone = 0.25 * (hash01(board, 1, self.seed) - 0.5);
                 mul(mix(self.base, self.second, 0.35 + (ring - 0.35) * keep), 1.0 + tone)
             }
             Pattern::Print => self.print(st, solid),
             Pattern::Text => {
-                let line = b > 0.25 && b < 0.75 && hash01((q[0] * 2.2).floor() as i32, j as i32, self.seed) > 0.3;
+                let line = b > 0.25 && b < 0.75 && hash01(floor(q[0] * 2.2), j, self.seed) > 0.3;
                 two(line && st[0].abs() < 0.85 && st[1].abs() < 0.9, 0.3)
             }
             Pattern::Speckle => {
@@ -172,7 +181,7 @@ impl Material {
             Pattern::Window => {
                 let pane = a > 0.25 && a < 0.75 && b > 0.2 && b < 0.75;
                 let frame = pane && ((a - 0.5).abs() < 0.02 || (b - 0.5).abs() < 0.02);
-                let tone = 0.5 + hash01(i as i32, j as i32, self.seed);
+                let tone = 0.5 + hash01(i, j, self.seed);
                 let c = two(pane && !frame, 0.27);
                 if pane { mul(c, 1.0 + (tone - 1.0) * keep) } else { c }
             }
@@ -225,11 +234,13 @@ impl Material {
     /// Asphalt with lane marks along the second coordinate.
     fn road(&self, uv: [f32; 2], footprint: f32) -> V3 {
         let lane = uv[0] / self.period;
-        let near = (lane - lane.round()).abs() * self.period;
-        let solid_line = lane.round() as i32 % 3 == 0;
-        let dash = (uv[1] / 6.0).rem_euclid(1.0) < 0.45;
+        let mark = floor(lane + 0.5);
+        let near = (lane - mark as f32).abs() * self.period;
+        let solid_line = mark % 3 == 0;
+        let dash = uv[1] / 6.0 - (floor(uv[1] / 6.0) as f32) < 0.45;
         let width = 0.08f32;
-        let cover = ((width + 0.5 * footprint - near) / footprint.max(1e-4)).clamp(0.0, 1.0) * (2.0 * width / footprint.max(2.0 * width));
+        let cover = ((width + 0.5 * footprint - near) / footprint.max(1e-4)).clamp(0.0, 1.0)
+            * (2.0 * width / footprint.max(2.0 * width));
         if solid_line || dash { mix(self.base, self.second, cover) } else { self.base }
     }
 }
