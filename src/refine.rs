@@ -1,12 +1,13 @@
 //! From the pixels that were answered to a map with a value at every pixel.
 
+mod surfaces;
+
 use image::RgbImage;
 use rayon::prelude::*;
 
-use crate::depth::interpolate::Plane;
-use crate::depth::mesh::{Mesh, NONE, Owner};
 use crate::depth::{SparseDepth, is_valid, pixel_count};
 use crate::error::{Error, Result};
+use surfaces::Surfaces;
 
 /// What the model said about one pixel.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -65,7 +66,7 @@ pub trait Fill: Send + Sync {
 /// Linear within surfaces, and at a depth edge each pixel goes to the side whose colour and place it fits, never between.
 ///
 /// Answers are joined to a Delaunay mesh, so any set works, a lattice or a set that is denser at edges. Inside a triangle
-/// whose corners and neighbours lie on one surface the *inverse* depth is interpolated linearly, which is exact for a plane
+/// whose corners and their neighbours lie on one surface the *inverse* depth is interpolated linearly, which is exact for a plane
 /// under a pinhole camera. Other triangles hold an edge: their corners and the corners behind their edges are
 /// sorted into surfaces by depth, each surface is weighted by nearness in colour and place, and the pixel takes the mean
 /// of the heaviest one. Doubt between the surfaces lowers the confidence and raises the expected error.
@@ -198,221 +199,5 @@ fn rim(depth: &[f32], width: usize, height: usize) -> Vec<usize> {
     (0..depth.len()).into_par_iter().filter(faces_a_hole).collect()
 }
 
-#[derive(Debug, Clone, Copy)]
-struct Value {
-    depth: f32,
-    confidence: f32,
-    error: f32,
-}
-
-/// An answer with all that is needed to weigh it.
-#[derive(Debug, Clone, Copy)]
-struct Site {
-    position: [f64; 2],
-    colour: [f32; 3],
-    value: Value,
-}
-
-/// What a triangle holds.
-enum Cell {
-    Surface { inverse: Plane, confidence: Plane, error: Plane },
-    Edge,
-}
-
-/// More candidates than this are not looked at for one pixel.
-const CANDIDATES: usize = 8;
-
-struct Surfaces<'a> {
-    options: EdgeAwareFill,
-    rgb: &'a RgbImage,
-    mesh: Mesh,
-    sites: Vec<Site>,
-    cells: Vec<Cell>,
-}
-
-impl<'a> Surfaces<'a> {
-    fn new(
-        options: &EdgeAwareFill,
-        input: &FillInput<'a>,
-        filled: &Filled,
-        pixels: &[usize],
-    ) -> Result<Self> {
-        let place = |&pixel: &usize| (pixel % input.width, pixel / input.width);
-        let positions: Vec<_> =
-            pixels.iter().map(place).map(|(x, y)| (x as f32, y as f32)).collect();
-        let mesh = Mesh::new(&positions, input.width, input.height)?;
-        let site = |&pixel: &usize| {
-            let (x, y) = place(&pixel);
-            let (depth, confidence, error) =
-                (filled.depth[pixel], filled.confidence[pixel], filled.expected_error[pixel]);
-            let value = Value { depth, confidence, error };
-            Site { position: [x as f64, y as f64], colour: guide(input.rgb, x, y), value }
-        };
-        // Pixels are distinct, so the mesh keeps them all and in this order.
-        let sites = pixels.par_iter().map(site).collect();
-        let mut surfaces =
-            Self { options: *options, rgb: input.rgb, mesh, sites, cells: Vec::new() };
-        surfaces.cells =
-            (0..surfaces.mesh.triangles.len()).into_par_iter().map(|t| surfaces.cell(t)).collect();
-        Ok(surfaces)
-    }
-
-    fn cell(&self, triangle: usize) -> Cell {
-        let corners = self.mesh.triangles[triangle].map(|s| self.sites[s as usize]);
-        let positions = corners.map(|c| c.position);
-        let inverse = Plane::through(positions, corners.map(|c| c.value.depth.recip()));
-        if self.is_edge(triangle, &corners, &inverse) {
-            return Cell::Edge;
-        }
-        let confidence = Plane::through(positions, corners.map(|c| c.value.confidence));
-        let error = Plane::through(positions, corners.map(|c| c.value.error));
-        Cell::Surface { inverse, confidence, error }
-    }
-
-    /// A steep surface and a step both have corners of different depth; only the surface goes on in the same
-    /// plane behind the triangle's edges.
-    fn is_edge(&self, triangle: usize, corners: &[Site; 3], inverse: &Plane) -> bool {
-        let depths = corners.map(|c| c.value.depth);
-        let near = depths[0].min(depths[1]).min(depths[2]);
-        let far = depths[0].max(depths[1]).max(depths[2]);
-        if far <= near * (1.0 + self.options.edge_ratio) {
-            return false;
-        }
-        let tolerance = 0.5 * f64::from(near.recip() - far.recip());
-        let mut alone = true;
-        for site in self.behind(triangle) {
-            alone = false;
-            let site = &self.sites[site];
-            let expected = inverse.extend(site.position[0], site.position[1]);
-            if (expected - f64::from(site.value.depth.recip())).abs() > tolerance {
-                return true;
-            }
-        }
-        alone
-    }
-
-    /// The far corners of the triangles behind the three edges.
-    fn behind(&self, triangle: usize) -> impl Iterator<Item = usize> + '_ {
-        let own = self.mesh.triangles[triangle];
-        let across = self.mesh.across[triangle].into_iter().filter(|&t| t != NONE);
-        across
-            .filter_map(move |t| {
-                self.mesh.triangles[t as usize].into_iter().find(|s| !own.contains(s))
-            })
-            .map(|s| s as usize)
-    }
-
-    fn at(&self, x: usize, y: usize, owner: Owner) -> Value {
-        let mut candidates = [0; CANDIDATES];
-        let mut count = 0;
-        let mut add = |site: usize| {
-            if count < CANDIDATES {
-                candidates[count] = site;
-                count += 1;
-            }
-        };
-        match owner {
-            Owner::Triangle(t) => match &self.cells[t] {
-                Cell::Surface { inverse, confidence, error } => {
-                    let (px, py) = (x as f64, y as f64);
-                    return Value {
-                        depth: inverse.at(px, py).recip(),
-                        confidence: confidence.at(px, py),
-                        error: error.at(px, py),
-                    };
-                }
-                Cell::Edge => {
-                    self.mesh.triangles[t].into_iter().for_each(|s| add(s as usize));
-                    self.behind(t).for_each(add);
-                }
-            },
-            Owner::Site(s) => {
-                add(s);
-                self.mesh.neighbours(s).iter().for_each(|&n| add(n as usize));
-            }
-        }
-        self.choose(x, y, &mut candidates[..count])
-    }
-
-    /// Sorts candidates into surfaces and takes the mean of the one that fits the pixel best.
-    fn choose(&self, x: usize, y: usize, candidates: &mut [usize]) -> Value {
-        let depth = |s: usize| self.sites[s].value.depth;
-        candidates.sort_unstable_by(|&a, &b| depth(a).total_cmp(&depth(b)));
-        let weights = self.weights(x, y, candidates);
-        let (mut best, mut best_weight, mut start) = (0..0, -1.0, 0);
-        for end in 1..=candidates.len() {
-            let gap = end == candidates.len()
-                || depth(candidates[end])
-                    > depth(candidates[end - 1]) * (1.0 + self.options.edge_ratio);
-            if gap {
-                let weight: f32 = weights[start..end].iter().sum();
-                if weight > best_weight {
-                    (best, best_weight) = (start..end, weight);
-                }
-                start = end;
-            }
-        }
-        self.blend(candidates, &weights[..candidates.len()], best)
-    }
-
-    /// Nearness in colour and in place, scaled so that the best candidate has weight 1.
-    fn weights(&self, x: usize, y: usize, candidates: &[usize]) -> [f32; CANDIDATES] {
-        let colour = guide(self.rgb, x, y);
-        let apart =
-            |s: &Site| (s.position[0] - x as f64).powi(2) + (s.position[1] - y as f64).powi(2);
-        let distances = || candidates.iter().map(|&s| apart(&self.sites[s]));
-        // The reach follows the local spacing of the answers, so that dense and thin regions behave alike.
-        let reach = distances().sum::<f64>() / candidates.len() as f64;
-        let mut exponents = [f32::INFINITY; CANDIDATES];
-        for ((exponent, &site), distance) in exponents.iter_mut().zip(candidates).zip(distances()) {
-            let other = self.sites[site].colour;
-            let squared: f32 = (0..3).map(|i| (colour[i] - other[i]).powi(2)).sum();
-            *exponent = 0.5 * squared / self.options.colour_sigma.powi(2)
-                + (distance / reach.max(1.0)) as f32;
-        }
-        let least = exponents.iter().copied().fold(f32::INFINITY, f32::min);
-        exponents.map(|e| (least - e).exp())
-    }
-
-    fn blend(
-        &self,
-        candidates: &[usize],
-        weights: &[f32],
-        chosen: std::ops::Range<usize>,
-    ) -> Value {
-        let values = || candidates.iter().map(|&s| self.sites[s].value).zip(weights);
-        let within = || values().take(chosen.end).skip(chosen.start);
-        let (total, share): (f32, f32) = (weights.iter().sum(), within().map(|(_, w)| w).sum());
-        let mean = |of: fn(&Value) -> f32| within().map(|(v, w)| of(&v) * w).sum::<f32>() / share;
-        // Candidates are sorted by depth; rounding must not carry the mean out of the surface.
-        let ends = within()
-            .map(|(v, _)| v.depth)
-            .fold((f32::INFINITY, 0.0f32), |(l, h), d| (l.min(d), h.max(d)));
-        let depth = mean(|v| v.depth.recip()).recip().max(ends.0).min(ends.1);
-        let elsewhere: f32 =
-            values().map(|(v, w)| (v.depth - depth).abs() * w).sum::<f32>() / total;
-        Value {
-            depth,
-            confidence: (mean(|v| v.confidence) * share / total).clamp(0.0, 1.0),
-            error: mean(|v| v.error) + elsewhere,
-        }
-    }
-}
-
-/// Colour of a pixel, half its own and half that of its four neighbours: less noise, and edges stay in place.
-fn guide(rgb: &RgbImage, x: usize, y: usize) -> [f32; 3] {
-    let (right, bottom) = (rgb.width() as usize - 1, rgb.height() as usize - 1);
-    let pixel = |x: usize, y: usize| rgb.get_pixel(x as u32, y as u32).0.map(f32::from);
-    let around = [
-        pixel(x.saturating_sub(1), y),
-        pixel((x + 1).min(right), y),
-        pixel(x, y.saturating_sub(1)),
-        pixel(x, (y + 1).min(bottom)),
-    ];
-    let own = pixel(x, y);
-    std::array::from_fn(|c| 0.5 * own[c] + 0.125 * around.iter().map(|p| p[c]).sum::<f32>())
-}
-
 #[cfg(test)]
-#[path = "refine_tests.rs"]
 mod tests;

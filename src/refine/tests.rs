@@ -114,6 +114,19 @@ fn no_pixel_flies_between_the_sides_of_an_edge() {
 }
 
 #[test]
+fn measurements_close_to_an_edge_do_not_hide_it() {
+    let (rgb, truth) = scene(160, 120);
+    for seed in 0..40 {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let places = (0..150).map(|_| (rng.random_range(0..160), rng.random_range(0..120)));
+        let points: Vec<_> = places.map(|(x, y)| (x, y, truth(x, y))).collect();
+        let sparse = SparseDepth::from_points(160, 120, &points).unwrap();
+        let filled = fill(&rgb, &lattice(160, 120, 8, &truth), &sparse).unwrap();
+        assert!(filled.depth.iter().all(|d| !(1.7..=3.9).contains(d)), "seed {seed}");
+    }
+}
+
+#[test]
 fn doubt_shows_at_an_edge_without_colour() {
     let grey = RgbImage::from_pixel(64, 32, Rgb([128; 3]));
     let step = |x: usize, _| if x < 30 { 1.0 } else { 3.0 };
