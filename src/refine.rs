@@ -99,12 +99,8 @@ impl Fill for EdgeAwareFill {
             .zip(filled.confidence.par_chunks_mut(width))
             .zip(filled.expected_error.par_chunks_mut(width));
         rows.enumerate().for_each(|(y, ((depth, confidence), error))| {
-            for (x, owner) in surfaces
-                .mesh
-                .owner_row(y)
-                .enumerate()
-                .filter(|(x, _)| depth[*x].is_nan())
-                .collect::<Vec<_>>()
+            for (x, owner) in
+                surfaces.mesh.owner_row(y).enumerate().filter(|(x, _)| depth[*x].is_nan()).collect::<Vec<_>>()
             {
                 let value = surfaces.at(x, y, owner);
                 (depth[x], confidence[x], error[x]) = (value.depth, value.confidence, value.error);
@@ -116,8 +112,7 @@ impl Fill for EdgeAwareFill {
 
 impl EdgeAwareFill {
     fn check(&self) -> Result<()> {
-        for (name, value) in [("edge_ratio", self.edge_ratio), ("colour_sigma", self.colour_sigma)]
-        {
+        for (name, value) in [("edge_ratio", self.edge_ratio), ("colour_sigma", self.colour_sigma)] {
             if !(value.is_finite() && value > 0.0) {
                 return Err(Error::argument(name, value, "a finite number above 0"));
             }
@@ -170,13 +165,10 @@ fn check_answer(answer: &Answered, width: usize, height: usize) -> Result<()> {
         ));
     }
     if is_valid(depth)
-        && !((0.0..=1.0).contains(&confidence)
-            && expected_error.is_finite()
-            && expected_error >= 0.0)
+        && !((0.0..=1.0).contains(&confidence) && expected_error.is_finite() && expected_error >= 0.0)
     {
-        let found = format!(
-            "confidence {confidence} and expected error {expected_error} at pixel ({x}, {y})"
-        );
+        let found =
+            format!("confidence {confidence} and expected error {expected_error} at pixel ({x}, {y})");
         return Err(Error::argument(
             "answer",
             found,
@@ -193,8 +185,7 @@ fn rim(depth: &[f32], width: usize, height: usize) -> Vec<usize> {
         let (x, y) = (pixel % width, pixel / width);
         let columns = x.saturating_sub(1)..(x + 2).min(width);
         let mut rows = y.saturating_sub(1)..(y + 2).min(height);
-        !depth[pixel].is_nan()
-            && rows.any(|row| columns.clone().any(|c| depth[row * width + c].is_nan()))
+        !depth[pixel].is_nan() && rows.any(|row| columns.clone().any(|c| depth[row * width + c].is_nan()))
     };
     (0..depth.len()).into_par_iter().filter(faces_a_hole).collect()
 }

@@ -52,13 +52,7 @@ impl ColourMap {
 ///
 /// # Errors
 /// [`Error::ImageSize`], [`Error::BufferLength`], [`Error::Argument`] unless `min` and `max` are finite and `min < max`.
-pub fn depth_to_rgb(
-    depth: &[f32],
-    width: usize,
-    height: usize,
-    min: f32,
-    max: f32,
-) -> Result<RgbImage> {
+pub fn depth_to_rgb(depth: &[f32], width: usize, height: usize, min: f32, max: f32) -> Result<RgbImage> {
     let valid = |d: f32| if is_valid(d) { d } else { f32::NAN };
     paint(ColourMap::Depth, depth, width, height, (min, max), valid)
 }
@@ -208,13 +202,8 @@ mod tests {
         assert_eq!(*image.get_pixel(0, 1), INVALID);
         assert!(MAPS.iter().all(|map| (0..=255).all(|i| map.colour(i as f32 / 255.0) != INVALID)));
         let confidence = confidence_to_rgb(&[0.0, 1.0], 2, 1).unwrap();
-        assert!(
-            to_oklab(*confidence.get_pixel(1, 0))[0] > to_oklab(*confidence.get_pixel(0, 0))[0]
-        );
-        assert_eq!(
-            error_to_rgb(&[-5.0], 1, 1, 5.0).unwrap().get_pixel(0, 0),
-            &ColourMap::Error.colour(1.0)
-        );
+        assert!(to_oklab(*confidence.get_pixel(1, 0))[0] > to_oklab(*confidence.get_pixel(0, 0))[0]);
+        assert_eq!(error_to_rgb(&[-5.0], 1, 1, 5.0).unwrap().get_pixel(0, 0), &ColourMap::Error.colour(1.0));
     }
 
     #[test]

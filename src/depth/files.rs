@@ -46,10 +46,7 @@ mod tests {
         let target = dir.path().join("is_a_directory");
         fs::create_dir(&target).unwrap();
         assert!(matches!(write_whole(&target, b"x"), Err(Error::Io { .. })));
-        assert!(matches!(
-            write_whole(&dir.path().join("no/such/place"), b"x"),
-            Err(Error::Io { .. })
-        ));
+        assert!(matches!(write_whole(&dir.path().join("no/such/place"), b"x"), Err(Error::Io { .. })));
         assert!(write_whole(Path::new("/"), b"x").is_err());
         assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 1);
     }

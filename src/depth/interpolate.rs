@@ -189,8 +189,7 @@ impl Interpolator {
     }
 
     fn paint(&self, values: &[f32], out: &mut [f32]) {
-        let planes: Vec<Plane> =
-            (0..self.mesh.triangles.len()).map(|t| self.plane(t, values)).collect();
+        let planes: Vec<Plane> = (0..self.mesh.triangles.len()).map(|t| self.plane(t, values)).collect();
         out.par_chunks_mut(self.mesh.width).enumerate().for_each(|(y, row)| {
             for ((x, pixel), owner) in row.iter_mut().enumerate().zip(self.mesh.owner_row(y)) {
                 *pixel = match owner {

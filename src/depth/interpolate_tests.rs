@@ -73,10 +73,8 @@ fn a_plane_is_reproduced_inside_the_hull() {
     let (w, h) = (64, 48);
     let plane = |x: f32, y: f32| 2.0 + 0.03 * x + 0.07 * y;
     let mut rng = ChaCha8Rng::seed_from_u64(7);
-    let mut points =
-        vec![(0.0, 0.0), (63.0, 0.0), (0.0, 47.0), (63.0, 47.0), (5.0, 5.0), (5.0, 5.0)];
-    points
-        .extend((0..60).map(|_| (rng.random_range(0.0..63.0f32), rng.random_range(0.0..47.0f32))));
+    let mut points = vec![(0.0, 0.0), (63.0, 0.0), (0.0, 47.0), (63.0, 47.0), (5.0, 5.0), (5.0, 5.0)];
+    points.extend((0..60).map(|_| (rng.random_range(0.0..63.0f32), rng.random_range(0.0..47.0f32))));
     let values: Vec<f32> = points.iter().map(|&(x, y)| plane(x, y)).collect();
     let mesh = Interpolator::new(&points, w, h).unwrap();
     for (i, v) in mesh.raster(&values).into_iter().enumerate() {
@@ -102,9 +100,7 @@ fn at_agrees_with_raster() {
         assert!((found - expected).abs() < 1e-4, "pixel {i}: {found} vs {expected}");
     }
     assert!(mesh.at(-30.0, 90.5, &values).is_finite());
-    assert!(
-        mesh.at(f32::NAN, 1.0, &values).is_nan() && mesh.at(1.0, f32::INFINITY, &values).is_nan()
-    );
+    assert!(mesh.at(f32::NAN, 1.0, &values).is_nan() && mesh.at(1.0, f32::INFINITY, &values).is_nan());
 }
 
 #[test]
@@ -122,8 +118,7 @@ fn leaving_out_points_without_holes_around_changes_nothing() {
     let (w, h) = (40, 30);
     // Not a plane, so that a different triangle would give a different value; no two triangulations tie inside a hole of
     // one pixel, whose value is a mean of its neighbours either way.
-    let full: Vec<f32> =
-        (0..w * h).map(|i| 2.0 + 0.01 * (i % w) as f32 + 0.02 * (i / w) as f32).collect();
+    let full: Vec<f32> = (0..w * h).map(|i| 2.0 + 0.01 * (i % w) as f32 + 0.02 * (i / w) as f32).collect();
     let mut holes = full.clone();
     for y in 8..20 {
         holes[y * w + 5..y * w + 25].fill(f32::NAN);
@@ -139,12 +134,9 @@ fn leaving_out_points_without_holes_around_changes_nothing() {
 fn a_large_set_and_awkward_positions_are_covered() {
     let sparse = scattered(31, 20_000, 320, 240);
     assert!(linear(&sparse).unwrap().iter().all(|d| d.is_finite()));
-    let ring: Vec<(f32, f32)> = (0..200)
-        .map(|i| i as f32 * 0.0314)
-        .map(|a| (50.0 + 40.0 * a.cos(), 50.0 + 40.0 * a.sin()))
-        .collect();
-    let lattice: Vec<(f32, f32)> =
-        (0..400).map(|i| ((i % 20 * 5) as f32, (i / 20 * 5) as f32)).collect();
+    let ring: Vec<(f32, f32)> =
+        (0..200).map(|i| i as f32 * 0.0314).map(|a| (50.0 + 40.0 * a.cos(), 50.0 + 40.0 * a.sin())).collect();
+    let lattice: Vec<(f32, f32)> = (0..400).map(|i| ((i % 20 * 5) as f32, (i / 20 * 5) as f32)).collect();
     let far = vec![
         (-1e30, 5.0),
         (1e30, 5.0),

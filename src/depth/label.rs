@@ -12,13 +12,7 @@ pub(crate) fn width(text: &str, scale: usize) -> usize {
 }
 
 /// Draws a text with its upper left corner at (x, y); what lies outside the image and letters without a glyph are left out.
-pub(crate) fn draw(
-    image: &mut RgbImage,
-    (x, y): (usize, usize),
-    text: &str,
-    scale: usize,
-    colour: Rgb<u8>,
-) {
+pub(crate) fn draw(image: &mut RgbImage, (x, y): (usize, usize), text: &str, scale: usize, colour: Rgb<u8>) {
     for (index, letter) in text.chars().enumerate() {
         let left = x + index * ADVANCE * scale;
         for (row, bits) in glyph(letter).into_iter().enumerate() {

@@ -4,9 +4,7 @@ use std::path::Path;
 
 use ndarray::ArrayView2;
 
-use super::{
-    DepthScale, SparseDepth, check_length, files, is_valid, npy, pixel_count, png16, view2,
-};
+use super::{DepthScale, SparseDepth, check_length, files, is_valid, npy, pixel_count, png16, view2};
 use crate::error::{Error, Result};
 
 /// Dense depth in metres (Z-depth) with a confidence, an expected error and a "measured" mark per pixel, all row-major.
@@ -62,9 +60,7 @@ impl DepthMap {
 
     /// Brings an invalid pixel into its one form, and refuses a valid one with values out of range.
     fn check_pixel(&mut self, pixel: usize) -> Result<()> {
-        let place = |value: f32| {
-            format!("{value} at pixel ({}, {})", pixel % self.width, pixel / self.width)
-        };
+        let place = |value: f32| format!("{value} at pixel ({}, {})", pixel % self.width, pixel / self.width);
         let (confidence, error) = (self.confidence[pixel], self.expected_error[pixel]);
         if !is_valid(self.depth[pixel]) {
             if self.measured[pixel] {
@@ -80,11 +76,7 @@ impl DepthMap {
         } else if !(0.0..=1.0).contains(&confidence) {
             return Err(Error::argument("confidence", place(confidence), "a value in 0..=1"));
         } else if !(error.is_finite() && error >= 0.0) {
-            return Err(Error::argument(
-                "expected error",
-                place(error),
-                "a finite value of at least 0 m",
-            ));
+            return Err(Error::argument("expected error", place(error), "a finite value of at least 0 m"));
         }
         Ok(())
     }
@@ -157,8 +149,7 @@ impl DepthMap {
         (self.width, self.height) == (sparse.width(), sparse.height())
             && (sparse.as_slice().iter().zip(&self.depth).zip(&self.measured)).all(
                 |((given, kept), &measured)| {
-                    measured != given.is_nan()
-                        && (given.is_nan() || given.to_bits() == kept.to_bits())
+                    measured != given.is_nan() && (given.is_nan() || given.to_bits() == kept.to_bits())
                 },
             )
     }
@@ -238,14 +229,8 @@ mod tests {
             build((good().0, vec![0.5; 5], good().2, good().3)),
             Err(Error::BufferLength { what: "confidence", .. })
         ));
-        assert!(matches!(
-            build((good().0, good().1, vec![], good().3)),
-            Err(Error::BufferLength { .. })
-        ));
-        assert!(matches!(
-            build((good().0, good().1, good().2, vec![true])),
-            Err(Error::BufferLength { .. })
-        ));
+        assert!(matches!(build((good().0, good().1, vec![], good().3)), Err(Error::BufferLength { .. })));
+        assert!(matches!(build((good().0, good().1, good().2, vec![true])), Err(Error::BufferLength { .. })));
         for bad in [-0.1, 1.1, f32::NAN] {
             let result = build((good().0, vec![1.0, bad, 1.0, 1.0], good().2, good().3));
             assert!(matches!(result, Err(Error::Argument { name: "confidence", .. })));
@@ -254,14 +239,8 @@ mod tests {
             let result = build((good().0, good().1, vec![0.0, 0.0, 0.0, bad], good().3));
             assert!(result.unwrap_err().to_string().contains("(1, 1)"));
         }
-        assert!(matches!(
-            map([0.0; 4], [true; 4]),
-            Err(Error::Argument { name: "measured depth", .. })
-        ));
-        assert!(matches!(
-            DepthMap::new(0, 0, vec![], vec![], vec![], vec![]),
-            Err(Error::ImageSize { .. })
-        ));
+        assert!(matches!(map([0.0; 4], [true; 4]), Err(Error::Argument { name: "measured depth", .. })));
+        assert!(matches!(DepthMap::new(0, 0, vec![], vec![], vec![], vec![]), Err(Error::ImageSize { .. })));
     }
 
     #[test]
@@ -284,10 +263,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("depth.png");
         let map = map([1.5, f32::NAN, 70.0, 65.535], [false; 4]).unwrap();
-        assert_eq!(
-            map.write_png16(&path, DepthScale::millimetres()).unwrap(),
-            Saturation { pixels: 1 }
-        );
+        assert_eq!(map.write_png16(&path, DepthScale::millimetres()).unwrap(), Saturation { pixels: 1 });
         assert_eq!(png16::read_png16(&path).unwrap(), (2, 2, vec![1500, 0, 65535, 65535]));
         assert_eq!(map.write_png16(&path, DepthScale::kitti()).unwrap(), Saturation { pixels: 0 });
         let back = SparseDepth::read(&path, Some(DepthScale::kitti())).unwrap();

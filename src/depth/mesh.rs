@@ -50,22 +50,10 @@ impl Mesh {
         }
         let (sites, origin) = distinct(points);
         let (triangles, across) = delaunay(&sites);
-        let (first, links) = if triangles.is_empty() {
-            chain(&sites)
-        } else {
-            neighbours(sites.len(), &triangles, &across)
-        };
-        let mut mesh = Self {
-            width,
-            height,
-            sites,
-            origin,
-            triangles,
-            across,
-            first,
-            links,
-            owner: Vec::new(),
-        };
+        let (first, links) =
+            if triangles.is_empty() { chain(&sites) } else { neighbours(sites.len(), &triangles, &across) };
+        let mut mesh =
+            Self { width, height, sites, origin, triangles, across, first, links, owner: Vec::new() };
         mesh.owner = mesh.owners(pixels);
         Ok(mesh)
     }
@@ -180,11 +168,7 @@ impl Mesh {
         let c = self.corners(triangle);
         let low = c[0][1].min(c[1][1]).min(c[2][1]).ceil().max(0.0);
         let high = c[0][1].max(c[1][1]).max(c[2][1]).floor().min((self.height - 1) as f64);
-        if high < low || cross(c[0], c[1], c[2]) == 0.0 {
-            (1, 0)
-        } else {
-            (low as u32, high as u32)
-        }
+        if high < low || cross(c[0], c[1], c[2]) == 0.0 { (1, 0) } else { (low as u32, high as u32) }
     }
 
     fn paint_triangles(&self, chunk: &mut [u32], top: usize, spans: &[(u32, u32)]) {
@@ -197,8 +181,7 @@ impl Mesh {
             let corners = self.corners(t);
             for y in rows {
                 let (left, right) = crossing(&corners, y as f64);
-                let (left, right) =
-                    (left.ceil().max(0.0), right.floor().min((self.width - 1) as f64));
+                let (left, right) = (left.ceil().max(0.0), right.floor().min((self.width - 1) as f64));
                 if left <= right {
                     let row = (y - top) * self.width;
                     chunk[row + left as usize..=row + right as usize].fill(t as u32);
@@ -214,8 +197,7 @@ impl Mesh {
             for (x, code) in row.iter_mut().enumerate() {
                 if *code == UNSET {
                     // Pixels are visited in order, so the last answer is at most a few steps away.
-                    let site =
-                        self.nearest([x as f64, (top + dy) as f64], last.unwrap_or(row_start));
+                    let site = self.nearest([x as f64, (top + dy) as f64], last.unwrap_or(row_start));
                     *code = site as u32 | SITE_BIT;
                     row_start = if last.is_none() { site } else { row_start };
                     last = Some(site);
@@ -254,8 +236,7 @@ fn crossing(corners: &[[f64; 2]; 3], y: f64) -> (f64, f64) {
         let (from, to) = if a[1] == b[1] {
             (a[0], b[0])
         } else {
-            let x =
-                if y == b[1] { b[0] } else { a[0] + (y - a[1]) * (b[0] - a[0]) / (b[1] - a[1]) };
+            let x = if y == b[1] { b[0] } else { a[0] + (y - a[1]) * (b[0] - a[0]) / (b[1] - a[1]) };
             (x, x)
         };
         left = left.min(from.min(to));
@@ -283,14 +264,9 @@ type Corners = Vec<[u32; 3]>;
 fn delaunay(sites: &[[f64; 2]]) -> (Corners, Corners) {
     let points: Vec<Point> = sites.iter().map(|&[x, y]| Point { x, y }).collect();
     let mesh = triangulate(&points);
-    let corners =
-        mesh.triangles.chunks_exact(3).map(|t| [t[0] as u32, t[1] as u32, t[2] as u32]).collect();
+    let corners = mesh.triangles.chunks_exact(3).map(|t| [t[0] as u32, t[1] as u32, t[2] as u32]).collect();
     let behind = |edge: usize| if edge == EMPTY { NONE } else { (edge / 3) as u32 };
-    let across = mesh
-        .halfedges
-        .chunks_exact(3)
-        .map(|e| [behind(e[0]), behind(e[1]), behind(e[2])])
-        .collect();
+    let across = mesh.halfedges.chunks_exact(3).map(|e| [behind(e[0]), behind(e[1]), behind(e[2])]).collect();
     (corners, across)
 }
 
@@ -316,8 +292,7 @@ fn chain(sites: &[[f64; 2]]) -> (Vec<u32>, Vec<u32>) {
         let (a, b) = (sites[a as usize], sites[b as usize]);
         a[0].total_cmp(&b[0]).then(a[1].total_cmp(&b[1]))
     });
-    let edges: Vec<(u32, u32)> =
-        order.windows(2).flat_map(|w| [(w[0], w[1]), (w[1], w[0])]).collect();
+    let edges: Vec<(u32, u32)> = order.windows(2).flat_map(|w| [(w[0], w[1]), (w[1], w[0])]).collect();
     compress(sites.len(), &edges)
 }
 

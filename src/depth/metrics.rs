@@ -28,11 +28,8 @@ pub struct Errors {
 /// [`Error::BufferLength`] for a wrong length, [`Error::Argument`] when there is no pixel to compare.
 pub fn errors(predicted: &[f32], truth: &[f32], sparse: &SparseDepth) -> Result<Errors> {
     check_length("ground truth", truth.len(), sparse.as_slice().len())?;
-    let unmeasured: Vec<f32> = truth
-        .iter()
-        .zip(sparse.as_slice())
-        .map(|(&t, s)| if s.is_nan() { t } else { f32::NAN })
-        .collect();
+    let unmeasured: Vec<f32> =
+        truth.iter().zip(sparse.as_slice()).map(|(&t, s)| if s.is_nan() { t } else { f32::NAN }).collect();
     errors_everywhere(predicted, &unmeasured)
 }
 
@@ -64,13 +61,7 @@ pub fn errors_everywhere(predicted: &[f32], truth: &[f32]) -> Result<Errors> {
         ));
     }
     let n = pixels as f64;
-    Ok(Errors {
-        mae: absolute / n,
-        rmse: (squared / n).sqrt(),
-        abs_rel: relative / n,
-        pixels,
-        missing,
-    })
+    Ok(Errors { mae: absolute / n, rmse: (squared / n).sqrt(), abs_rel: relative / n, pixels, missing })
 }
 
 /// Mean over frames: each frame counts the same, whatever its number of pixels (the usual protocol); counts are summed.
@@ -79,8 +70,7 @@ pub fn mean(frames: &[Errors]) -> Option<Errors> {
     if frames.is_empty() {
         return None;
     }
-    let mean_of =
-        |value: fn(&Errors) -> f64| frames.iter().map(value).sum::<f64>() / frames.len() as f64;
+    let mean_of = |value: fn(&Errors) -> f64| frames.iter().map(value).sum::<f64>() / frames.len() as f64;
     Some(Errors {
         mae: mean_of(|e| e.mae),
         rmse: mean_of(|e| e.rmse),
@@ -119,10 +109,7 @@ mod tests {
         let small = Errors { mae: 1.0, rmse: 2.0, abs_rel: 0.5, pixels: 1, missing: 2 };
         let large = Errors { mae: 3.0, rmse: 4.0, abs_rel: 0.1, pixels: 99, missing: 0 };
         let both = mean(&[small, large]).unwrap();
-        assert_eq!(
-            (both.mae, both.rmse, both.abs_rel, both.pixels, both.missing),
-            (2.0, 3.0, 0.3, 100, 2)
-        );
+        assert_eq!((both.mae, both.rmse, both.abs_rel, both.pixels, both.missing), (2.0, 3.0, 0.3, 100, 2));
         assert_eq!(mean(&[]), None);
     }
 }

@@ -51,12 +51,7 @@ pub fn read_npy(path: impl AsRef<Path>) -> Result<Npy> {
 /// # Errors
 /// [`Error::ImageSize`], [`Error::BufferLength`] unless there are `width * height` values, [`Error::Io`]; the file is then as
 /// it was before.
-pub fn write_npy(
-    path: impl AsRef<Path>,
-    width: usize,
-    height: usize,
-    values: &[f32],
-) -> Result<()> {
+pub fn write_npy(path: impl AsRef<Path>, width: usize, height: usize, values: &[f32]) -> Result<()> {
     files::write_whole(path.as_ref(), &encode(width, height, values)?)
 }
 
@@ -66,8 +61,7 @@ pub fn write_npy(
 /// [`Error::ImageSize`], [`Error::BufferLength`] unless there are `width * height` values.
 pub fn encode(width: usize, height: usize, values: &[f32]) -> Result<Vec<u8>> {
     check_length("npy array", values.len(), pixel_count(width, height)?)?;
-    let mut header =
-        format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({height}, {width}), }}");
+    let mut header = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({height}, {width}), }}");
     // The format asks for data that starts at a multiple of 64 bytes and a header that ends in a newline.
     while !(MAGIC.len() + 4 + header.len() + 1).is_multiple_of(64) {
         header.push(' ');
@@ -111,11 +105,7 @@ fn read_header(reader: &mut impl Read, path: &Path) -> Result<String> {
         1 => usize::from(u16::from_le_bytes(read_array(reader, path)?)),
         2 | 3 => u32::from_le_bytes(read_array(reader, path)?) as usize,
         version => {
-            return Err(Error::format(
-                path,
-                format!("format version {version}"),
-                "version 1, 2 or 3",
-            ));
+            return Err(Error::format(path, format!("format version {version}"), "version 1, 2 or 3"));
         }
     };
     if length > MAX_HEADER {
@@ -127,8 +117,7 @@ fn read_header(reader: &mut impl Read, path: &Path) -> Result<String> {
     }
     let mut header = vec![0; length];
     reader.read_exact(&mut header).map_err(|e| truncated(e, path))?;
-    String::from_utf8(header)
-        .map_err(|_| Error::format(path, "a header that is not text", EXPECTED))
+    String::from_utf8(header).map_err(|_| Error::format(path, "a header that is not text", EXPECTED))
 }
 
 fn read_array<const N: usize>(reader: &mut impl Read, path: &Path) -> Result<[u8; N]> {
@@ -165,18 +154,15 @@ impl Kind {
     fn decode(self, data: &[u8]) -> Values {
         match self {
             Kind::F32 => Values::F32(
-                data.chunks_exact(4)
-                    .map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]]))
-                    .collect(),
+                data.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect(),
             ),
             Kind::F64 => {
-                let value =
-                    |b: &[u8]| f64::from_le_bytes([b[0], b[1], b[2], b[3], b[4], b[5], b[6], b[7]]);
+                let value = |b: &[u8]| f64::from_le_bytes([b[0], b[1], b[2], b[3], b[4], b[5], b[6], b[7]]);
                 Values::F64(data.chunks_exact(8).map(value).collect())
             }
-            Kind::U16 => Values::U16(
-                data.chunks_exact(2).map(|b| u16::from_le_bytes([b[0], b[1]])).collect(),
-            ),
+            Kind::U16 => {
+                Values::U16(data.chunks_exact(2).map(|b| u16::from_le_bytes([b[0], b[1]])).collect())
+            }
         }
     }
 }
@@ -209,10 +195,8 @@ fn parse_header(header: &str) -> std::result::Result<(Kind, usize, usize), Strin
 
 /// What stands behind a key.
 fn field<'a>(header: &'a str, key: &str) -> std::result::Result<&'a str, String> {
-    let behind =
-        |quote: char| header.split_once(&format!("{quote}{key}{quote}")).map(|(_, rest)| rest);
-    let rest =
-        behind('\'').or_else(|| behind('"')).and_then(|rest| rest.trim_start().strip_prefix(':'));
+    let behind = |quote: char| header.split_once(&format!("{quote}{key}{quote}")).map(|(_, rest)| rest);
+    let rest = behind('\'').or_else(|| behind('"')).and_then(|rest| rest.trim_start().strip_prefix(':'));
     rest.map(str::trim_start).ok_or_else(|| format!("a header without `{key}`"))
 }
 

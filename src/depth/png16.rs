@@ -27,12 +27,7 @@ pub fn read_png16(path: impl AsRef<Path>) -> Result<(usize, usize, Vec<u16>)> {
 /// # Errors
 /// [`Error::ImageSize`], [`Error::BufferLength`], [`Error::Format`] if the encoder fails, [`Error::Io`]; the file is then as it
 /// was before.
-pub fn write_png16(
-    path: impl AsRef<Path>,
-    width: usize,
-    height: usize,
-    stored: &[u16],
-) -> Result<()> {
+pub fn write_png16(path: impl AsRef<Path>, width: usize, height: usize, stored: &[u16]) -> Result<()> {
     files::write_whole(path.as_ref(), &encode(width, height, stored)?)
 }
 
@@ -54,8 +49,7 @@ pub fn encode(width: usize, height: usize, stored: &[u16]) -> Result<Vec<u8>> {
 fn decode(bytes: &[u8], path: &Path) -> Result<(usize, usize, Vec<u16>)> {
     let (width, height) = check_header(bytes, path)?;
     let bad = |e: image::ImageError| Error::format(path, e.to_string(), EXPECTED);
-    let decoder =
-        PngDecoder::with_limits(Cursor::new(bytes), image::Limits::default()).map_err(bad)?;
+    let decoder = PngDecoder::with_limits(Cursor::new(bytes), image::Limits::default()).map_err(bad)?;
     match DynamicImage::from_decoder(decoder).map_err(bad)? {
         DynamicImage::ImageLuma16(image) => Ok((width, height, image.into_raw())),
         other => Err(Error::format(path, format!("{:?} pixels", other.color()), EXPECTED)),
@@ -64,12 +58,10 @@ fn decode(bytes: &[u8], path: &Path) -> Result<(usize, usize, Vec<u16>)> {
 
 /// Width and height from the IHDR chunk, if it announces 16-bit grey and the file can really hold that many pixels.
 fn check_header(bytes: &[u8], path: &Path) -> Result<(usize, usize)> {
-    let head =
-        bytes.get(..26).filter(|b| b.starts_with(b"\x89PNG\r\n\x1a\n") && b[12..16] == *b"IHDR");
+    let head = bytes.get(..26).filter(|b| b.starts_with(b"\x89PNG\r\n\x1a\n") && b[12..16] == *b"IHDR");
     let head = head.ok_or_else(|| Error::format(path, "no PNG header", EXPECTED))?;
-    let number = |at: usize| {
-        u32::from_be_bytes([head[at], head[at + 1], head[at + 2], head[at + 3]]) as usize
-    };
+    let number =
+        |at: usize| u32::from_be_bytes([head[at], head[at + 1], head[at + 2], head[at + 3]]) as usize;
     let (width, height, bits, colour) = (number(16), number(20), head[24], head[25]);
     if (bits, colour) != (16, 0) {
         let name = match colour {
@@ -101,9 +93,7 @@ mod tests {
 
     fn picture(colour: ExtendedColorType, bytes_per_pixel: usize) -> Vec<u8> {
         let mut bytes = Vec::new();
-        PngEncoder::new(&mut bytes)
-            .write_image(&vec![9; 6 * bytes_per_pixel], 3, 2, colour)
-            .unwrap();
+        PngEncoder::new(&mut bytes).write_image(&vec![9; 6 * bytes_per_pixel], 3, 2, colour).unwrap();
         bytes
     }
 

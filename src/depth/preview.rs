@@ -44,11 +44,7 @@ pub fn panel(
     let mut tiles = vec![
         Tile::new("RGB", enlarge(rgb), None),
         Tile::new("SPARSE", draw_points(rgb, sparse, range), Some((ColourMap::Depth, range, " m"))),
-        Tile::new(
-            "DEPTH",
-            depth_tile(dense.depth(), w, h, range)?,
-            Some((ColourMap::Depth, range, " m")),
-        ),
+        Tile::new("DEPTH", depth_tile(dense.depth(), w, h, range)?, Some((ColourMap::Depth, range, " m"))),
         Tile::new(
             "CONFIDENCE",
             enlarge(&confidence_to_rgb(&known(dense), w, h)?),
@@ -62,11 +58,7 @@ pub fn panel(
         let error = enlarge(&error_to_rgb(&error, w, h, top)?);
         tiles.insert(
             3,
-            Tile::new(
-                "GROUND TRUTH",
-                depth_tile(truth, w, h, range)?,
-                Some((ColourMap::Depth, range, " m")),
-            ),
+            Tile::new("GROUND TRUTH", depth_tile(truth, w, h, range)?, Some((ColourMap::Depth, range, " m"))),
         );
         tiles.push(Tile::new("ERROR", error, Some((ColourMap::Error, (0.0, top), " m"))));
     }
@@ -141,8 +133,7 @@ fn number(value: f32) -> String {
 }
 
 fn arrange(tiles: &[Tile], columns: usize) -> RgbImage {
-    let (w, h) =
-        tiles.first().map_or((0, 0), |t| (t.image.width() as usize, t.image.height() as usize));
+    let (w, h) = tiles.first().map_or((0, 0), |t| (t.image.width() as usize, t.image.height() as usize));
     let rows = tiles.len().div_ceil(columns);
     let (step_x, step_y) = (w + GAP, h + CAPTION + GAP);
     let size = ((columns * step_x + GAP) as u32, (rows * step_y + GAP) as u32);
@@ -166,12 +157,7 @@ fn enlarge(image: &RgbImage) -> RgbImage {
     RgbImage::from_fn(image.width() * k, image.height() * k, |x, y| *image.get_pixel(x / k, y / k))
 }
 
-fn depth_tile(
-    depth: &[f32],
-    width: usize,
-    height: usize,
-    (low, high): (f32, f32),
-) -> Result<RgbImage> {
+fn depth_tile(depth: &[f32], width: usize, height: usize, (low, high): (f32, f32)) -> Result<RgbImage> {
     Ok(enlarge(&depth_to_rgb(depth, width, height, low, high)?))
 }
 
@@ -210,8 +196,7 @@ fn known(dense: &DepthMap) -> Vec<f32> {
 }
 
 fn absolute_error(depth: &[f32], truth: &[f32]) -> Vec<f32> {
-    let error =
-        |(&d, &t): (&f32, &f32)| if is_valid(d) && is_valid(t) { (d - t).abs() } else { f32::NAN };
+    let error = |(&d, &t): (&f32, &f32)| if is_valid(d) && is_valid(t) { (d - t).abs() } else { f32::NAN };
     depth.iter().zip(truth).map(error).collect()
 }
 
@@ -222,16 +207,12 @@ mod tests {
     fn parts(w: usize, h: usize) -> (RgbImage, SparseDepth, DepthMap, Vec<f32>) {
         let rgb = RgbImage::from_pixel(w as u32, h as u32, Rgb([90, 120, 60]));
         let truth: Vec<f32> = (0..w * h).map(|i| 1.0 + (i % w) as f32 * 0.1).collect();
-        let sparse = SparseDepth::from_points(
-            w,
-            h,
-            &[(2, 2, 1.2), (w - 3, h - 3, 1.0 + (w - 3) as f32 * 0.1)],
-        )
-        .unwrap();
+        let sparse =
+            SparseDepth::from_points(w, h, &[(2, 2, 1.2), (w - 3, h - 3, 1.0 + (w - 3) as f32 * 0.1)])
+                .unwrap();
         let depth = truth.iter().map(|t| t * 1.1).collect();
         let dense =
-            DepthMap::new(w, h, depth, vec![0.8; w * h], vec![0.1; w * h], vec![false; w * h])
-                .unwrap();
+            DepthMap::new(w, h, depth, vec![0.8; w * h], vec![0.1; w * h], vec![false; w * h]).unwrap();
         (rgb, sparse, dense, truth)
     }
 
@@ -270,8 +251,7 @@ mod tests {
         assert!(panel(&rgb, &sparse, &dense, Some(&truth)).unwrap().width() >= 3 * 320);
         let none = SparseDepth::new(6, 5, vec![0.0; 30]).unwrap();
         let invalid =
-            DepthMap::new(6, 5, vec![0.0; 30], vec![0.0; 30], vec![0.0; 30], vec![false; 30])
-                .unwrap();
+            DepthMap::new(6, 5, vec![0.0; 30], vec![0.0; 30], vec![0.0; 30], vec![false; 30]).unwrap();
         assert!(panel(&rgb, &none, &invalid, None).is_ok());
         assert!(panel(&rgb, &none, &invalid, Some(&[f32::NAN; 30])).is_ok());
     }

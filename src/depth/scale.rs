@@ -73,17 +73,17 @@ impl FromStr for DepthScale {
             "mm" | "millimetres" | "millimeters" => Ok(Self::millimetres()),
             "kitti" => Ok(Self::kitti()),
             "tum" => Ok(Self::tum()),
-            other => other
-                .parse::<f32>()
-                .ok()
-                .and_then(|units| Self::units_per_metre(units).ok())
-                .ok_or_else(|| {
-                    Error::argument(
-                        "depth scale",
-                        text,
-                        "mm, kitti, tum or a positive number of units per metre",
-                    )
-                }),
+            other => {
+                other.parse::<f32>().ok().and_then(|units| Self::units_per_metre(units).ok()).ok_or_else(
+                    || {
+                        Error::argument(
+                            "depth scale",
+                            text,
+                            "mm, kitti, tum or a positive number of units per metre",
+                        )
+                    },
+                )
+            }
         }
     }
 }
@@ -99,10 +99,7 @@ mod tests {
         assert_eq!("tum".parse::<DepthScale>().unwrap(), DepthScale::tum());
         assert_eq!("100".parse::<DepthScale>().unwrap().units(), 100.0);
         for bad in ["", "metres", "0", "-5", "nan", "inf", "1e-42", "1e60"] {
-            assert!(
-                matches!(bad.parse::<DepthScale>(), Err(Error::Argument { .. })),
-                "{bad:?} was accepted"
-            );
+            assert!(matches!(bad.parse::<DepthScale>(), Err(Error::Argument { .. })), "{bad:?} was accepted");
         }
     }
 

@@ -46,11 +46,7 @@ impl SparseDepth {
     ///
     /// # Errors
     /// [`Error::Argument`] for a point outside the frame, otherwise as [`SparseDepth::new`].
-    pub fn from_points(
-        width: usize,
-        height: usize,
-        points: &[(usize, usize, f32)],
-    ) -> Result<Self> {
+    pub fn from_points(width: usize, height: usize, points: &[(usize, usize, f32)]) -> Result<Self> {
         let mut depth = vec![f32::NAN; pixel_count(width, height)?];
         for &(x, y, value) in points {
             if x >= width || y >= height {
@@ -141,10 +137,7 @@ fn check_range(x: usize, y: usize, value: f32) -> Result<()> {
 }
 
 /// A depth file as (width, height, metres); invalid values are left as they are for the caller to judge.
-pub(crate) fn read_metres(
-    path: &Path,
-    scale: Option<DepthScale>,
-) -> Result<(usize, usize, Vec<f32>)> {
+pub(crate) fn read_metres(path: &Path, scale: Option<DepthScale>) -> Result<(usize, usize, Vec<f32>)> {
     let extension = path.extension().and_then(|e| e.to_str()).unwrap_or("").to_ascii_lowercase();
     match extension.as_str() {
         "png" => {
@@ -170,10 +163,8 @@ pub(crate) fn read_metres(
 
 fn need_scale(path: &Path, scale: Option<DepthScale>) -> Result<DepthScale> {
     scale.ok_or_else(|| {
-        let expected = format!(
-            "the unit of the integers in {}: mm, kitti, tum or units per metre",
-            path.display()
-        );
+        let expected =
+            format!("the unit of the integers in {}: mm, kitti, tum or units per metre", path.display());
         Error::argument("depth scale", "none", expected)
     })
 }
@@ -199,10 +190,7 @@ mod tests {
         assert!(matches!(wrong, Err(Error::BufferLength { expected: 6, found: 5, .. })));
         assert!(matches!(SparseDepth::new(0, 2, vec![]), Err(Error::ImageSize { .. })));
         assert!(matches!(SparseDepth::new(usize::MAX, 2, vec![]), Err(Error::ImageSize { .. })));
-        assert!(matches!(
-            SparseDepth::from_points(usize::MAX, 1, &[]),
-            Err(Error::ImageSize { .. })
-        ));
+        assert!(matches!(SparseDepth::from_points(usize::MAX, 1, &[]), Err(Error::ImageSize { .. })));
     }
 
     #[test]
@@ -226,10 +214,7 @@ mod tests {
         assert_eq!(sparse.max(), Some(3.0));
         assert_eq!(sparse.view()[[1, 2]], 3.0);
         for outside in [(3, 0, 1.0), (0, 2, 1.0)] {
-            assert!(matches!(
-                SparseDepth::from_points(3, 2, &[outside]),
-                Err(Error::Argument { .. })
-            ));
+            assert!(matches!(SparseDepth::from_points(3, 2, &[outside]), Err(Error::Argument { .. })));
         }
     }
 
@@ -237,10 +222,7 @@ mod tests {
     fn a_map_without_points_is_accepted_until_points_are_required() {
         let sparse = SparseDepth::new(2, 2, vec![0.0; 4]).unwrap();
         assert_eq!((sparse.measured(), sparse.max()), (0, None));
-        assert!(matches!(
-            sparse.require_points(),
-            Err(Error::NoMeasurement { width: 2, height: 2 })
-        ));
+        assert!(matches!(sparse.require_points(), Err(Error::NoMeasurement { width: 2, height: 2 })));
     }
 
     #[test]
@@ -252,17 +234,8 @@ mod tests {
         let from_png = SparseDepth::read(&png, Some(DepthScale::kitti())).unwrap();
         let from_npy = SparseDepth::read(&npy, None).unwrap();
         assert_eq!(from_png.points().collect::<Vec<_>>(), from_npy.points().collect::<Vec<_>>());
-        assert!(matches!(
-            SparseDepth::read(&png, None),
-            Err(Error::Argument { name: "depth scale", .. })
-        ));
-        assert!(matches!(
-            SparseDepth::read(dir.path().join("d.exr"), None),
-            Err(Error::Format { .. })
-        ));
-        assert!(matches!(
-            SparseDepth::read(dir.path().join("none.npy"), None),
-            Err(Error::Io { .. })
-        ));
+        assert!(matches!(SparseDepth::read(&png, None), Err(Error::Argument { name: "depth scale", .. })));
+        assert!(matches!(SparseDepth::read(dir.path().join("d.exr"), None), Err(Error::Format { .. })));
+        assert!(matches!(SparseDepth::read(dir.path().join("none.npy"), None), Err(Error::Io { .. })));
     }
 }

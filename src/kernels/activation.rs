@@ -92,8 +92,7 @@ impl CustomOp2 for SwiGlu {
         let (dg, du) = read3(gate, up, grad, |g, u, d| {
             let mut dg = vec![0f32; g.len()];
             let mut du = vec![0f32; g.len()];
-            let inputs =
-                g.par_chunks(CHUNK).zip(u.par_chunks(CHUNK)).zip(d.par_chunks(CHUNK));
+            let inputs = g.par_chunks(CHUNK).zip(u.par_chunks(CHUNK)).zip(d.par_chunks(CHUNK));
             dg.par_chunks_mut(CHUNK)
                 .zip(du.par_chunks_mut(CHUNK))
                 .zip(inputs)
@@ -135,18 +134,11 @@ impl CustomOp1 for Gelu {
         let x = slice(s, l)?;
         let level = Level::current();
         let mut out = vec![0f32; x.len()];
-        out.par_chunks_mut(CHUNK)
-            .zip(x.par_chunks(CHUNK))
-            .for_each(|(o, x)| gelu_chunk(level, o, x));
+        out.par_chunks_mut(CHUNK).zip(x.par_chunks(CHUNK)).for_each(|(o, x)| gelu_chunk(level, o, x));
         Ok(output(out, l.shape().clone()))
     }
 
-    fn bwd(
-        &self,
-        x: &Tensor,
-        _res: &Tensor,
-        grad: &Tensor,
-    ) -> candle_core::Result<Option<Tensor>> {
+    fn bwd(&self, x: &Tensor, _res: &Tensor, grad: &Tensor) -> candle_core::Result<Option<Tensor>> {
         let level = Level::current();
         let shape = x.shape().clone();
         let dx = read2(x, grad, |x, d| {

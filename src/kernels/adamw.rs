@@ -98,7 +98,8 @@ mod tests {
                     let g = g[i] as f64 * 0.5;
                     em[i] = 0.9 * em[i] + 0.1 * g;
                     ev[i] = 0.99 * ev[i] + 0.01 * g * g;
-                    let (mh, vh) = (em[i] / (1.0 - 0.9f64.powi(step as i32)), ev[i] / (1.0 - 0.99f64.powi(step as i32)));
+                    let (mh, vh) =
+                        (em[i] / (1.0 - 0.9f64.powi(step as i32)), ev[i] / (1.0 - 0.99f64.powi(step as i32)));
                     exact[i] -= 0.01 * (mh / (vh.sqrt() + 1e-8) + 0.1 * exact[i]);
                 }
             }

@@ -137,8 +137,7 @@ fn check(layout: &AttentionLayout, nq: usize, nk: usize, shared_rows: usize) -> 
             || (!block.shared.is_empty() && block.shared.end > shared_rows)
             || own_end.is_none_or(|end| end > nk)
         {
-            let expected =
-                format!("rows within {nq} queries, {nk} keys and {shared_rows} shared keys");
+            let expected = format!("rows within {nq} queries, {nk} keys and {shared_rows} shared keys");
             return wrong(found(), &expected);
         }
     }

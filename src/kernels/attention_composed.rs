@@ -12,13 +12,10 @@ pub(super) fn composed(
     layout: &AttentionLayout,
 ) -> Result<Tensor> {
     let (sk, sv) = shared.unwrap_or((k, v));
-    let mut blocks: Vec<&Block> =
-        layout.blocks.iter().filter(|b| !b.queries.is_empty()).collect();
+    let mut blocks: Vec<&Block> = layout.blocks.iter().filter(|b| !b.queries.is_empty()).collect();
     blocks.sort_by_key(|b| b.queries.start);
     let (mut parts, mut at) = (Vec::new(), 0);
-    let zeros = |rows: usize| {
-        Tensor::zeros((rows, layout.heads * layout.head_dim), q.dtype(), q.device())
-    };
+    let zeros = |rows: usize| Tensor::zeros((rows, layout.heads * layout.head_dim), q.dtype(), q.device());
     for block in blocks {
         if block.queries.start > at {
             parts.push(zeros(block.queries.start - at)?);
@@ -73,7 +70,8 @@ fn attend(
     let p = candle_nn::ops::softmax(&scores, D::Minus1)?.to_dtype(q.dtype())?;
     let mut out = Vec::new();
     if n_shared > 0 {
-        let p = p.narrow(3, 0, n_shared)?.contiguous()?.reshape((kv_heads, 1, items * group * qp, n_shared))?;
+        let p =
+            p.narrow(3, 0, n_shared)?.contiguous()?.reshape((kv_heads, 1, items * group * qp, n_shared))?;
         out.push(p.matmul(&values[0])?.reshape((kv_heads, items, group * qp, hd))?);
     }
     if kp > 0 {

@@ -254,12 +254,15 @@ impl CustomOp3 for Conv {
 
 #[cfg(test)]
 mod tests {
-    use super::super::testing::{at_every_level, check_gradients, close, gradients, random, same_on_any_thread_count};
+    use super::super::testing::{
+        at_every_level, check_gradients, close, gradients, random, same_on_any_thread_count,
+    };
     use super::*;
 
     #[test]
     fn forward_is_candles() {
-        for (b, h, w, cin, cout) in [(1, 1, 1, 1, 1), (2, 19, 7, 3, 5), (1, 5, 40, 16, 32), (1, 3, 3, 33, 40)] {
+        for (b, h, w, cin, cout) in [(1, 1, 1, 1, 1), (2, 19, 7, 3, 5), (1, 5, 40, 16, 32), (1, 3, 3, 33, 40)]
+        {
             let (x, weight) = (random(&[b, h, w, cin], 1), random(&[cout, cin, 3, 3], 2));
             let bias = random(&[cout], 3);
             let expected = composed(&x, &weight, Some(&bias)).unwrap();

@@ -10,10 +10,7 @@ pub(super) fn on_cpu(tensors: &[&Tensor]) -> bool {
 }
 
 /// The elements of a contiguous f32 CPU storage.
-pub(super) fn slice<'a>(
-    storage: &'a CpuStorage,
-    layout: &Layout,
-) -> candle_core::Result<&'a [f32]> {
+pub(super) fn slice<'a>(storage: &'a CpuStorage, layout: &Layout) -> candle_core::Result<&'a [f32]> {
     let all = storage.as_slice::<f32>()?;
     match layout.contiguous_offsets() {
         Some((start, end)) => Ok(&all[start..end]),
@@ -102,10 +99,7 @@ pub(super) fn dims2(name: &'static str, tensor: &Tensor) -> Result<(usize, usize
 }
 
 /// The dimensions of a tensor that must have four.
-pub(super) fn dims4(
-    name: &'static str,
-    tensor: &Tensor,
-) -> Result<(usize, usize, usize, usize)> {
+pub(super) fn dims4(name: &'static str, tensor: &Tensor) -> Result<(usize, usize, usize, usize)> {
     match tensor.dims() {
         &[b, h, w, c] => Ok((b, h, w, c)),
         dims => Err(Error::argument(name, format!("shape {dims:?}"), "four dimensions")),

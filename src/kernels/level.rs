@@ -79,10 +79,7 @@ fn choose(asked: Option<&str>) -> Level {
     match available.iter().find(|level| level.name() == asked) {
         Some(level) => *level,
         None => {
-            tracing::warn!(
-                "SDIM_KERNEL={asked} is not available here; using {}",
-                fastest.name()
-            );
+            tracing::warn!("SDIM_KERNEL={asked} is not available here; using {}", fastest.name());
             fastest
         }
     }

@@ -1,6 +1,8 @@
 //! Matrix product with a weight, and a bias.
 
-use super::exec::{chunk_rows, dims2, expect_dims, map_chunks, on_cpu, output, read, read2, slice, sum_in_order, tensor};
+use super::exec::{
+    chunk_rows, dims2, expect_dims, map_chunks, on_cpu, output, read, read2, slice, sum_in_order, tensor,
+};
 use super::level::Level;
 use super::panels::{Init, Lhs, Panels, multiply};
 use crate::error::Result;
@@ -94,13 +96,17 @@ pub(super) fn bias_grad(grad: &[f32], m: usize) -> Vec<f32> {
 }
 
 /// Gradients of `x` and `weight`, each only where something asks for it: frozen weights are common.
-fn backward(x: &Tensor, weight: &Tensor, grad: &Tensor) -> candle_core::Result<(Option<Tensor>, Option<Tensor>)> {
+fn backward(
+    x: &Tensor,
+    weight: &Tensor,
+    grad: &Tensor,
+) -> candle_core::Result<(Option<Tensor>, Option<Tensor>)> {
     let ((n, k), m) = (x.dims2()?, weight.dim(0)?);
     read(grad, |grad| {
         read2(x, weight, |xs, ws| {
-            let dx = x.track_op().then(|| {
-                tensor(product(grad, n, m, &Panels::from_rows(ws, k, m, k), k, Init::Zero), (n, k))
-            });
+            let dx = x
+                .track_op()
+                .then(|| tensor(product(grad, n, m, &Panels::from_rows(ws, k, m, k), k, Init::Zero), (n, k)));
             let dw = weight.track_op().then(|| tensor(weight_grad(grad, xs, n, k, m), (m, k)));
             Ok((dx.transpose()?, dw.transpose()?))
         })
@@ -173,7 +179,9 @@ impl CustomOp3 for Linear {
 
 #[cfg(test)]
 mod tests {
-    use super::super::testing::{at_every_level, check_gradients, close, gradients, random, same_on_any_thread_count};
+    use super::super::testing::{
+        at_every_level, check_gradients, close, gradients, random, same_on_any_thread_count,
+    };
     use super::*;
 
     fn composed(x: &Tensor, w: &Tensor, b: &Tensor) -> Result<Tensor> {

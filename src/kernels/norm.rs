@@ -1,6 +1,8 @@
 //! RMS normalisation.
 
-use super::exec::{chunk_rows, dims2, expect_dims, map_chunks, on_cpu, output, read3, slice, sum_in_order, tensor};
+use super::exec::{
+    chunk_rows, dims2, expect_dims, map_chunks, on_cpu, output, read3, slice, sum_in_order, tensor,
+};
 use super::level::{Level, per_level};
 use crate::error::Result;
 use candle_core::{CpuStorage, CustomOp2, D, Layout, Shape, Tensor};
@@ -134,7 +136,9 @@ impl CustomOp2 for RmsNorm {
 
 #[cfg(test)]
 mod tests {
-    use super::super::testing::{at_every_level, check_gradients, close, gradients, random, same_on_any_thread_count};
+    use super::super::testing::{
+        at_every_level, check_gradients, close, gradients, random, same_on_any_thread_count,
+    };
     use super::*;
 
     #[test]

@@ -324,8 +324,7 @@ mod tests {
             multiply(level, &mut dst, 3, 3, lhs, &Panels::from_rows(&b, 3, 6, 3), Init::Zero);
             for (i, found) in dst.iter().enumerate() {
                 let (r, c) = (i / 3, i % 3);
-                let expected: f32 =
-                    (0..6).map(|p| a[r * 2 + p % 3 + p / 3 * 20] * b[p * 3 + c]).sum();
+                let expected: f32 = (0..6).map(|p| a[r * 2 + p % 3 + p / 3 * 20] * b[p * 3 + c]).sum();
                 assert!((found - expected).abs() < 1e-5);
             }
         }

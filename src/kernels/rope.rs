@@ -25,12 +25,7 @@ pub fn rope(x: &Tensor, cos: &Tensor, sin: &Tensor, heads: usize) -> Result<Tens
     if !on_cpu(&[x, cos, sin]) {
         return composed(x, cos, sin, heads);
     }
-    let op = Rope {
-        cos: cos.detach().contiguous()?,
-        sin: sin.detach().contiguous()?,
-        heads,
-        back: false,
-    };
+    let op = Rope { cos: cos.detach().contiguous()?, sin: sin.detach().contiguous()?, heads, back: false };
     Ok(x.contiguous()?.apply_op1(op)?)
 }
 
@@ -94,11 +89,9 @@ impl CustomOp1 for Rope {
             let sign = if self.back { -1.0 } else { 1.0 };
             read2(&self.cos, &self.sin, |cos, sin| {
                 let angles = cos.par_chunks(rows * half).zip(sin.par_chunks(rows * half));
-                out.par_chunks_mut(rows * width)
-                    .zip(x.par_chunks(rows * width).zip(angles))
-                    .for_each(|(o, (x, (cos, sin)))| {
-                        rope_chunk(level, o, x, cos, sin, half, self.heads, sign)
-                    });
+                out.par_chunks_mut(rows * width).zip(x.par_chunks(rows * width).zip(angles)).for_each(
+                    |(o, (x, (cos, sin)))| rope_chunk(level, o, x, cos, sin, half, self.heads, sign),
+                );
                 Ok(())
             })?;
         }
@@ -130,7 +123,10 @@ mod tests {
     #[test]
     fn a_quarter_turn_moves_the_first_half_to_the_second() {
         let x = Tensor::new(&[[1f32, 2., 3., 4.]], &candle_core::Device::Cpu).unwrap();
-        let (cos, sin) = (x.narrow(1, 0, 2).unwrap().zeros_like().unwrap(), x.narrow(1, 0, 2).unwrap().ones_like().unwrap());
+        let (cos, sin) = (
+            x.narrow(1, 0, 2).unwrap().zeros_like().unwrap(),
+            x.narrow(1, 0, 2).unwrap().ones_like().unwrap(),
+        );
         let turned = rope(&x, &cos, &sin, 1).unwrap();
         assert_eq!(turned.to_vec2::<f32>().unwrap(), [[-3., -4., 1., 2.]]);
     }

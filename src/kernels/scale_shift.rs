@@ -301,7 +301,9 @@ impl CustomOp3 for ScaleShift {
 
 #[cfg(test)]
 mod tests {
-    use super::super::testing::{at_every_level, check_gradients, close, gradients, random, same_on_any_thread_count};
+    use super::super::testing::{
+        at_every_level, check_gradients, close, gradients, random, same_on_any_thread_count,
+    };
     use super::*;
 
     fn inputs(dims: &[usize]) -> [Tensor; 3] {
@@ -316,7 +318,8 @@ mod tests {
         for dims in [[1, 1, 2, 1], [2, 5, 7, 3], [3, 17, 20, 16]] {
             let t = inputs(&dims);
             let (expected, mean, var) = batch_norm_composed(&t[0], &t[1], &t[2], 1e-5, 0.1).unwrap();
-            let expected_grads = gradients(&t, |t| Ok(batch_norm_composed(&t[0], &t[1], &t[2], 1e-5, 0.1)?.0));
+            let expected_grads =
+                gradients(&t, |t| Ok(batch_norm_composed(&t[0], &t[1], &t[2], 1e-5, 0.1)?.0));
             at_every_level(|| {
                 let (out, m, v) = batch_norm_act(&t[0], &t[1], &t[2], 1e-5, 0.1).unwrap();
                 close(&out, &expected, 1e-4);

@@ -49,8 +49,7 @@ impl<'a> Surfaces<'a> {
         pixels: &[usize],
     ) -> Result<Self> {
         let place = |&pixel: &usize| (pixel % input.width, pixel / input.width);
-        let positions: Vec<_> =
-            pixels.iter().map(place).map(|(x, y)| (x as f32, y as f32)).collect();
+        let positions: Vec<_> = pixels.iter().map(place).map(|(x, y)| (x as f32, y as f32)).collect();
         let mesh = Mesh::new(&positions, input.width, input.height)?;
         let site = |&pixel: &usize| {
             let (x, y) = place(&pixel);
@@ -61,8 +60,7 @@ impl<'a> Surfaces<'a> {
         };
         // Pixels are distinct, so the mesh keeps them all and in this order.
         let sites = pixels.par_iter().map(site).collect();
-        let mut surfaces =
-            Self { options: *options, rgb: input.rgb, mesh, sites, cells: Vec::new() };
+        let mut surfaces = Self { options: *options, rgb: input.rgb, mesh, sites, cells: Vec::new() };
         surfaces.cells =
             (0..surfaces.mesh.triangles.len()).into_par_iter().map(|t| surfaces.cell(t)).collect();
         Ok(surfaces)
@@ -114,9 +112,7 @@ impl<'a> Surfaces<'a> {
         let own = self.mesh.triangles[triangle];
         let across = self.mesh.across[triangle].into_iter().filter(|&t| t != NONE);
         across
-            .filter_map(move |t| {
-                self.mesh.triangles[t as usize].into_iter().find(|s| !own.contains(s))
-            })
+            .filter_map(move |t| self.mesh.triangles[t as usize].into_iter().find(|s| !own.contains(s)))
             .map(|s| s as usize)
     }
 
@@ -160,8 +156,7 @@ impl<'a> Surfaces<'a> {
         let (mut best, mut best_weight, mut start) = (0..0, -1.0, 0);
         for end in 1..=candidates.len() {
             let gap = end == candidates.len()
-                || depth(candidates[end])
-                    > depth(candidates[end - 1]) * (1.0 + self.options.edge_ratio);
+                || depth(candidates[end]) > depth(candidates[end - 1]) * (1.0 + self.options.edge_ratio);
             if gap {
                 let weight: f32 = weights[start..end].iter().sum();
                 if weight > best_weight {
@@ -176,8 +171,7 @@ impl<'a> Surfaces<'a> {
     /// Nearness in colour and in place, scaled so that the best candidate has weight 1.
     fn weights(&self, x: usize, y: usize, candidates: &[usize]) -> [f32; CANDIDATES] {
         let colour = guide(self.rgb, x, y);
-        let apart =
-            |s: &Site| (s.position[0] - x as f64).powi(2) + (s.position[1] - y as f64).powi(2);
+        let apart = |s: &Site| (s.position[0] - x as f64).powi(2) + (s.position[1] - y as f64).powi(2);
         let mut distances = [f64::INFINITY; CANDIDATES];
         for (distance, &site) in distances.iter_mut().zip(candidates) {
             *distance = apart(&self.sites[site]);
@@ -189,30 +183,23 @@ impl<'a> Surfaces<'a> {
         for ((exponent, &site), distance) in exponents.iter_mut().zip(candidates).zip(distances) {
             let other = self.sites[site].colour;
             let squared: f32 = (0..3).map(|i| (colour[i] - other[i]).powi(2)).sum();
-            *exponent = 0.5 * squared / self.options.colour_sigma.powi(2)
-                + (distance / reach.max(1.0)) as f32;
+            *exponent =
+                0.5 * squared / self.options.colour_sigma.powi(2) + (distance / reach.max(1.0)) as f32;
         }
         let least = exponents.iter().copied().fold(f32::INFINITY, f32::min);
         exponents.map(|e| (least - e).exp())
     }
 
-    fn blend(
-        &self,
-        candidates: &[usize],
-        weights: &[f32],
-        chosen: std::ops::Range<usize>,
-    ) -> Value {
+    fn blend(&self, candidates: &[usize], weights: &[f32], chosen: std::ops::Range<usize>) -> Value {
         let values = || candidates.iter().map(|&s| self.sites[s].value).zip(weights);
         let within = || values().take(chosen.end).skip(chosen.start);
         let (total, share): (f32, f32) = (weights.iter().sum(), within().map(|(_, w)| w).sum());
         let mean = |of: fn(&Value) -> f32| within().map(|(v, w)| of(&v) * w).sum::<f32>() / share;
         // Candidates are sorted by depth; rounding must not carry the mean out of the surface.
-        let ends = within()
-            .map(|(v, _)| v.depth)
-            .fold((f32::INFINITY, 0.0f32), |(l, h), d| (l.min(d), h.max(d)));
+        let ends =
+            within().map(|(v, _)| v.depth).fold((f32::INFINITY, 0.0f32), |(l, h), d| (l.min(d), h.max(d)));
         let depth = mean(|v| v.depth.recip()).recip().max(ends.0).min(ends.1);
-        let elsewhere: f32 =
-            values().map(|(v, w)| (v.depth - depth).abs() * w).sum::<f32>() / total;
+        let elsewhere: f32 = values().map(|(v, w)| (v.depth - depth).abs() * w).sum::<f32>() / total;
         Value {
             depth,
             confidence: (mean(|v| v.confidence) * share / total).clamp(0.0, 1.0),

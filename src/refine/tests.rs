@@ -7,12 +7,7 @@ fn answer(x: usize, y: usize, depth: f32) -> Answered {
     Answered { x, y, depth, confidence: 0.9, expected_error: 0.05 }
 }
 
-fn lattice(
-    width: usize,
-    height: usize,
-    stride: usize,
-    depth: impl Fn(usize, usize) -> f32,
-) -> Vec<Answered> {
+fn lattice(width: usize, height: usize, stride: usize, depth: impl Fn(usize, usize) -> f32) -> Vec<Answered> {
     let rows = (0..height).step_by(stride);
     rows.flat_map(|y| (0..width).step_by(stride).map(move |x| (x, y)))
         .map(|(x, y)| answer(x, y, depth(x, y)))
@@ -24,13 +19,7 @@ fn no_points(width: usize, height: usize) -> SparseDepth {
 }
 
 fn fill(rgb: &RgbImage, asked: &[Answered], sparse: &SparseDepth) -> Result<Filled> {
-    let input = FillInput {
-        width: rgb.width() as usize,
-        height: rgb.height() as usize,
-        rgb,
-        asked,
-        sparse,
-    };
+    let input = FillInput { width: rgb.width() as usize, height: rgb.height() as usize, rgb, asked, sparse };
     EdgeAwareFill::default().fill(&input)
 }
 
@@ -42,8 +31,7 @@ fn scene(width: usize, height: usize) -> (RgbImage, impl Fn(usize, usize) -> f32
     };
     let mut rng = ChaCha8Rng::seed_from_u64(1);
     let rgb = RgbImage::from_fn(width as u32, height as u32, |x, y| {
-        let base: [u8; 3] =
-            if inside(x as usize, y as usize) { [180, 90, 60] } else { [60, 90, 150] };
+        let base: [u8; 3] = if inside(x as usize, y as usize) { [180, 90, 60] } else { [60, 90, 150] };
         Rgb(base.map(|c| c + rng.random_range(0..12)))
     });
     (rgb, move |x, y| if inside(x, y) { 1.5 + 0.001 * y as f32 } else { 4.0 })
@@ -82,8 +70,7 @@ fn every_pixel_is_filled_within_range_from_any_set() {
         [&random, &line, &[answer(3, 3, 2.0)], &random[..2], &lattice(40, 30, 1, &truth)];
     for asked in cases {
         let filled = fill(&rgb, asked, &no_points(40, 30)).unwrap();
-        let (low, high) =
-            asked.iter().fold((f32::MAX, 0.0f32), |(l, h), a| (l.min(a.depth), h.max(a.depth)));
+        let (low, high) = asked.iter().fold((f32::MAX, 0.0f32), |(l, h), a| (l.min(a.depth), h.max(a.depth)));
         // Inverting twice may round by one unit in the last place.
         assert!(
             filled.depth.iter().all(|&d| d >= low * 0.999_999 && d <= high * 1.000_001),
@@ -102,10 +89,7 @@ fn no_pixel_flies_between_the_sides_of_an_edge() {
         let filled = fill(&rgb, &lattice(160, 120, stride, &truth), &no_points(160, 120)).unwrap();
         let mut wrong = 0;
         for (i, &d) in filled.depth.iter().enumerate() {
-            assert!(
-                !(1.7..=3.9).contains(&d),
-                "stride {stride}, pixel {i}: {d} is on neither side"
-            );
+            assert!(!(1.7..=3.9).contains(&d), "stride {stride}, pixel {i}: {d} is on neither side");
             wrong += usize::from((d - truth(i % 160, i / 160)).abs() > 0.1);
         }
         // The lattice alone cannot know where between two answers the edge lies; the colours do.
@@ -155,12 +139,9 @@ fn a_plane_in_space_is_exact_however_steep() {
 #[test]
 fn unreadable_answers_are_filled_and_no_answer_fills_nothing() {
     let (rgb, _) = scene(20, 20);
-    let filled = fill(
-        &rgb,
-        &[answer(2, 2, f32::NAN), answer(5, 5, -1.0), answer(9, 9, 2.5)],
-        &no_points(20, 20),
-    )
-    .unwrap();
+    let filled =
+        fill(&rgb, &[answer(2, 2, f32::NAN), answer(5, 5, -1.0), answer(9, 9, 2.5)], &no_points(20, 20))
+            .unwrap();
     assert!(filled.depth.iter().all(|&d| d == 2.5));
     let filled = fill(&rgb, &[answer(2, 2, f32::NAN)], &no_points(20, 20)).unwrap();
     assert!(filled.depth.iter().all(|d| d.is_nan()) && filled.confidence.iter().all(|&c| c == 0.0));
@@ -179,10 +160,7 @@ fn bad_input_is_refused() {
         Answered { confidence: f32::NAN, ..answer(0, 0, 1.0) },
         Answered { expected_error: -1.0, ..answer(0, 0, 1.0) },
     ] {
-        assert!(
-            matches!(fill(&rgb, &[bad], &none), Err(Error::Argument { name: "answer", .. })),
-            "{bad:?}"
-        );
+        assert!(matches!(fill(&rgb, &[bad], &none), Err(Error::Argument { name: "answer", .. })), "{bad:?}");
     }
     assert!(matches!(fill(&rgb, &[], &no_points(10, 20)), Err(Error::SizeMismatch { .. })));
     let input = FillInput { width: 20, height: 11, rgb: &rgb, asked: &[], sparse: &none };

@@ -1,0 +1,23 @@
+//! Dense metric depth from an RGB frame and sparse depth, by asking a vision-language model how far each pixel is.
+#![deny(missing_docs)]
+#![deny(unsafe_op_in_unsafe_fn)]
+#![warn(clippy::all)]
+
+pub mod complete;
+pub mod depth;
+pub mod error;
+pub mod fusion;
+pub mod kernels;
+pub mod model;
+pub mod query;
+pub mod refine;
+#[cfg(feature = "train")]
+pub mod scenes;
+#[cfg(feature = "train")]
+pub mod supervise;
+pub mod vlm;
+
+pub use complete::{CompleteOptions, Completion, DepthCompleter, Preserve};
+pub use depth::{DepthMap, DepthScale, SparseDepth};
+pub use error::{Error, Result};
+pub use query::QueryPlan;

@@ -1,0 +1,252 @@
+//! A checkpoint of the depth completion model: Qwen2.5-VL, the fusion block, and the way it is asked.
+
+use crate::depth::SparseDepth;
+use crate::error::{Error, Result};
+use crate::fusion::{Fusion, Normalise};
+use crate::query::{Prefix, PromptWriter, Settings};
+use crate::vlm::QwenVl;
+use crate::vlm::config::{VlmConfig, read_json};
+use crate::vlm::patch_embed::PatchEmbed;
+use crate::vlm::preprocess::{Pixels, PreprocessorConfig};
+use crate::vlm::tokenizer::Tokenizer;
+use crate::vlm::weights::Weights;
+use candle_core::{DType, Device, Tensor};
+use image::RgbImage;
+use std::path::Path;
+
+/// The fusion block with the second patch embedding (F_e2 of Eq. 3a).
+pub struct DepthInjection {
+    /// I and S to O.
+    pub fusion: Fusion,
+    /// O to tokens.
+    pub patch_embed: PatchEmbed,
+}
+
+/// A loaded checkpoint. Immutable: caches are arguments.
+pub struct SdimModel {
+    /// The vision-language model.
+    pub vlm: QwenVl,
+    /// What adds sparse depth to the image tokens; `None` for a checkpoint without it.
+    pub injection: Option<DepthInjection>,
+    /// How frames are resized and normalised.
+    pub preprocessor: PreprocessorConfig,
+    /// How it is asked.
+    pub prompts: PromptWriter,
+    /// Its vocabulary.
+    pub tokenizer: Tokenizer,
+    /// Rows of the output head that can continue a number, `[numbers, hidden]`.
+    pub number_rows: Tensor,
+    /// Where its tensors are.
+    pub device: Device,
+}
+
+/// The files of a checkpoint that are not tensors.
+pub struct CheckpointFiles {
+    /// `config.json`
+    pub config: VlmConfig,
+    /// `preprocessor_config.json`
+    pub preprocessor: PreprocessorConfig,
+    /// `sdim.json`
+    pub settings: Settings,
+    /// `tokenizer.json`
+    pub tokenizer: Tokenizer,
+}
+
+fn parse(file: &Path, bytes: &[u8]) -> Result<serde_json::Value> {
+    serde_json::from_slice(bytes).map_err(|e| Error::format(file, e.to_string(), "valid JSON"))
+}
+
+impl CheckpointFiles {
+    /// From the bytes of the four files.
+    ///
+    /// # Errors
+    /// Typed errors that name the file and key.
+    pub fn from_bytes(
+        dir: &str,
+        config: &[u8],
+        preprocessor: &[u8],
+        settings: &[u8],
+        tokenizer: &[u8],
+    ) -> Result<Self> {
+        let path = |name: &str| Path::new(dir).join(name);
+        let text = |name: &str| path(name).display().to_string();
+        let json = |name: &str, bytes: &[u8]| parse(&path(name), bytes);
+        Ok(Self {
+            config: VlmConfig::from_json(&text("config.json"), &json("config.json", config)?)?,
+            preprocessor: PreprocessorConfig::from_json(
+                &text("preprocessor_config.json"),
+                &json("preprocessor_config.json", preprocessor)?,
+            )?,
+            settings: Settings::from_bytes(&path("sdim.json"), settings)?,
+            tokenizer: Tokenizer::from_bytes(&path("tokenizer.json"), tokenizer)?,
+        })
+    }
+
+    /// From a directory. Without `sdim.json` the checkpoint is plain Qwen2.5-VL, asked in the paper's words.
+    ///
+    /// # Errors
+    /// Typed errors that name the file and key.
+    pub fn from_dir(dir: &Path) -> Result<Self> {
+        let json = |name: &str| -> Result<(String, serde_json::Value)> {
+            let path = dir.join(name);
+            Ok((path.display().to_string(), read_json(&path)?))
+        };
+        let (file, value) = json("config.json")?;
+        let config = VlmConfig::from_json(&file, &value)?;
+        let (file, value) = json("preprocessor_config.json")?;
+        let preprocessor = PreprocessorConfig::from_json(&file, &value)?;
+        let path = dir.join("sdim.json");
+        let settings = if path.exists() {
+            Settings::from_bytes(&path, &std::fs::read(&path).map_err(Error::io(&path))?)?
+        } else {
+            Settings::paper()
+        };
+        Ok(Self {
+            config,
+            preprocessor,
+            settings,
+            tokenizer: Tokenizer::from_file(&dir.join("tokenizer.json"))?,
+        })
+    }
+}
+
+impl SdimModel {
+    /// Builds the model; `strict` fails on missing or unread tensors.
+    ///
+    /// # Errors
+    /// [`Error::Config`] if the preprocessor's patches are not the model's; tensor and tokenizer errors.
+    pub fn new(files: CheckpointFiles, weights: &Weights, device: &Device) -> Result<Self> {
+        let CheckpointFiles { config, preprocessor, settings, tokenizer } = files;
+        let v = &config.vision;
+        let patches = (preprocessor.patch_size, preprocessor.merge_size, preprocessor.temporal_patch_size);
+        if patches != (v.patch_size, v.merge_size, v.temporal_patch_size) {
+            return Err(Error::config(
+                "preprocessor_config.json",
+                "patch_size, merge_size, temporal_patch_size",
+                format!("{patches:?}"),
+                "the values of config.json",
+            ));
+        }
+        let prompts = PromptWriter::new(&settings, &tokenizer)?;
+        let injection = match &settings.fusion {
+            Some(fusion) => Some(DepthInjection {
+                fusion: Fusion::new(fusion, weights)?,
+                patch_embed: PatchEmbed::new(v, weights, "sdim.patch_embed.proj")?,
+            }),
+            None => None,
+        };
+        let vlm = QwenVl::new(config, weights, settings.rope_layout)?;
+        weights.finish()?;
+        let number_rows = vlm.decoder.head_rows(&prompts.numbers().ids)?;
+        Ok(Self { vlm, injection, preprocessor, prompts, tokenizer, number_rows, device: device.clone() })
+    }
+
+    /// Folds what inference need not keep apart.
+    ///
+    /// # Errors
+    /// [`Error::Tensors`] if a tensor operation fails.
+    pub fn fold(mut self) -> Result<Self> {
+        if let Some(injection) = &mut self.injection {
+            injection.fusion.fold()?;
+        }
+        Ok(self)
+    }
+
+    /// Loads a checkpoint directory: `config.json`, `preprocessor_config.json`, `tokenizer.json`, `model.safetensors`,
+    /// and `sdim.json` if it has one.
+    ///
+    /// # Errors
+    /// Typed errors that name the file, key or tensor.
+    pub fn load(dir: &Path, device: &Device) -> Result<Self> {
+        let files = CheckpointFiles::from_dir(dir)?;
+        let weights = Weights::from_file(&dir.join("model.safetensors"), DType::F32, device)?;
+        Self::new(files, &weights, device)?.fold()
+    }
+
+    /// Resizes a frame and scatters its measurements: pixels, and `[1, h, w, 1]` in number units with 0 where nothing
+    /// was measured.
+    ///
+    /// # Errors
+    /// [`Error::SizeMismatch`], [`Error::ImageSize`].
+    pub fn preprocess(&self, rgb: &RgbImage, sparse: &SparseDepth) -> Result<(Pixels, Tensor)> {
+        let size = (rgb.width() as usize, rgb.height() as usize);
+        let depth = (sparse.width(), sparse.height());
+        if size != depth {
+            return Err(Error::SizeMismatch { rgb: size, depth });
+        }
+        let pixels = self.preprocessor.resize(rgb)?;
+        let (w, h) = (pixels.resized.width() as usize, pixels.resized.height() as usize);
+        let scattered = scatter(sparse, w, h, self.prompts.unit(sparse));
+        Ok((pixels, Tensor::from_vec(scattered, (1, h, w, 1), &self.device)?))
+    }
+
+    /// Image tokens of a frame with its measurements (Eq. 1-3).
+    ///
+    /// # Errors
+    /// [`Error::Tensors`] on mismatched shapes.
+    pub fn encode(&self, pixels: &Pixels, scattered: &Tensor) -> Result<Tensor> {
+        let patches = self.preprocessor.patches(pixels, &self.device)?;
+        let mut embedded = self.vlm.vision.patch_embed.forward(&patches)?; // F_e1(I)
+        if let Some(injection) = &self.injection {
+            let rgb = self.preprocessor.image(pixels, &self.device)?.unsqueeze(0)?;
+            let o = injection.fusion.forward(&rgb, scattered, Normalise::Running)?;
+            let tokens = injection.patch_embed.forward_image(&o.squeeze(0)?, pixels.grid)?;
+            embedded = (embedded + tokens)?; // Eq. 3a
+        }
+        self.vlm.vision.encode(&embedded, &[pixels.grid])
+    }
+
+    /// Reads the shared prefix of a frame into a cache.
+    ///
+    /// # Errors
+    /// [`Error::Tensors`] on mismatched shapes.
+    pub fn read_prefix(
+        &self,
+        pixels: &Pixels,
+        image_tokens: &Tensor,
+        sparse: &SparseDepth,
+    ) -> Result<Prefix> {
+        let resized = (pixels.resized.width() as usize, pixels.resized.height() as usize);
+        let (tokens, space) = self.prompts.prefix(sparse, pixels.grid, resized, &self.vlm.config, 0)?;
+        let embedded = self.vlm.embed_prompt(&tokens.ids, image_tokens)?;
+        let mut cache = self.vlm.decoder.cache(1);
+        self.vlm.prefill(&embedded, &tokens.positions, &mut cache)?;
+        Ok(Prefix { cache, space })
+    }
+}
+
+/// Moves measurements to the pixels of the resized frame, in units of `unit` metres, 0 elsewhere. Where several fall on
+/// one pixel, the one nearest to its centre stays: nothing is averaged or interpolated.
+pub fn scatter(sparse: &SparseDepth, width: usize, height: usize, unit: f32) -> Vec<f32> {
+    let mut out = vec![0f32; width * height];
+    let mut off = vec![f32::MAX; width * height];
+    let (sx, sy) = (width as f32 / sparse.width() as f32, height as f32 / sparse.height() as f32);
+    for (x, y, depth) in sparse.points() {
+        let (fx, fy) = ((x as f32 + 0.5) * sx, (y as f32 + 0.5) * sy);
+        let at = (fy as usize).min(height - 1) * width + (fx as usize).min(width - 1);
+        let distance = (fx.fract() - 0.5).powi(2) + (fy.fract() - 0.5).powi(2);
+        if distance < off[at] {
+            off[at] = distance;
+            out[at] = depth / unit;
+        }
+    }
+    out
+}
+
+/// The checkpoint that ships inside the crate.
+///
+/// # Errors
+/// [`Error::Tensors`] if the device refuses the tensors.
+#[cfg(feature = "tiny")]
+pub fn tiny(device: &Device) -> Result<SdimModel> {
+    let files = CheckpointFiles::from_bytes(
+        "sdim-tiny",
+        include_bytes!("../assets/sdim-tiny/config.json"),
+        include_bytes!("../assets/sdim-tiny/preprocessor_config.json"),
+        include_bytes!("../assets/sdim-tiny/sdim.json"),
+        include_bytes!("../assets/sdim-tiny/tokenizer.json"),
+    )?;
+    let bytes = include_bytes!("../assets/sdim-tiny/model.safetensors");
+    let weights = Weights::from_bytes("sdim-tiny/model.safetensors", bytes, DType::F32, device)?;
+    SdimModel::new(files, &weights, device)?.fold()
+}

@@ -1,0 +1,299 @@
+//! Numbers as tokens: how a depth is written into a prompt, and how an answer is read from logits.
+
+use crate::error::{Error, Result};
+use crate::vlm::tokenizer::Tokenizer;
+
+/// What the number 1 means in prompts and answers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum DepthUnit {
+    /// One metre.
+    Metres,
+    /// The frame's largest measurement.
+    FrameMax,
+}
+
+/// How a number is written, a property of the checkpoint.
+#[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(tag = "kind", rename_all = "snake_case")]
+pub enum NumberFormat {
+    /// One token per depth bin, `<|d0|>` to `<|d{bins-1}|>`, over 0 .. `range` units.
+    Bins {
+        /// Number of bins.
+        bins: usize,
+        /// Upper end of the last bin, in [`DepthUnit`]s.
+        range: f64,
+    },
+    /// Decimal digits, one token each, with a fixed number of decimals ("4.230").
+    Digits {
+        /// Digits after the point.
+        decimals: usize,
+        /// Digits before the point, at most.
+        integers: usize,
+    },
+}
+
+/// A number format with the ids of its tokens.
+#[derive(Debug, Clone)]
+pub struct Numbers {
+    /// How numbers are written.
+    pub format: NumberFormat,
+    /// Token ids: one per bin; or `0` to `9` and the point.
+    pub ids: Vec<u32>,
+}
+
+/// Index of the decimal point among the rows of a [`NumberFormat::Digits`] head.
+pub const POINT: usize = 10;
+
+/// An answer in units of the frame.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Reading {
+    /// Median of the distribution; NaN if nothing could be read.
+    pub value: f32,
+    /// Probability that the truth lies within 5 % of `value`, as the model sees it; in 0..=1, higher is surer.
+    pub confidence: f32,
+    /// Expected absolute error, same unit as `value`.
+    pub expected_error: f32,
+}
+
+impl Reading {
+    /// No readable number.
+    pub const INVALID: Self = Self { value: f32::NAN, confidence: 0.0, expected_error: f32::NAN };
+}
+
+/// Half-width of the interval whose probability is the confidence, relative to the answer.
+const CONFIDENT_WITHIN: f32 = 0.05;
+
+impl NumberFormat {
+    /// Checks the sizes of a configuration.
+    ///
+    /// # Errors
+    /// [`Error::Config`] names the field of `sdim.json`.
+    pub fn validate(&self, file: &str) -> Result<()> {
+        let (key, found, ok, expected) = match *self {
+            NumberFormat::Bins { bins, range } => (
+                "number.bins",
+                format!("{bins} bins over {range}"),
+                (2..=100_000).contains(&bins) && range.is_finite() && range > 0.0,
+                "2 to 100000 bins over a positive range",
+            ),
+            NumberFormat::Digits { decimals, integers } => (
+                "number.decimals",
+                format!("{integers}.{decimals}"),
+                (1..=6).contains(&decimals) && (1..=6).contains(&integers),
+                "1 to 6 digits before and after the point",
+            ),
+        };
+        if ok { Ok(()) } else { Err(Error::config(file, key, found, expected)) }
+    }
+}
+
+impl Numbers {
+    /// Looks the tokens up.
+    ///
+    /// # Errors
+    /// [`Error::Tokenizer`] names a token that the vocabulary lacks.
+    pub fn new(format: NumberFormat, tokenizer: &Tokenizer) -> Result<Self> {
+        let ids = match format {
+            NumberFormat::Bins { bins, .. } => {
+                (0..bins).map(|k| tokenizer.id(&bin_token(k))).collect::<Result<_>>()?
+            }
+            NumberFormat::Digits { .. } => {
+                "0123456789.".chars().map(|c| tokenizer.id(&c.to_string())).collect::<Result<_>>()?
+            }
+        };
+        Ok(Self { format, ids })
+    }
+
+    /// The tokens of a value in units, as indices into `ids`. Values out of range are clamped.
+    pub fn write(&self, value: f32) -> Vec<usize> {
+        match self.format {
+            NumberFormat::Bins { bins, range } => {
+                let k = (f64::from(value) / range * bins as f64).floor();
+                vec![(k.max(0.0) as usize).min(bins - 1)]
+            }
+            NumberFormat::Digits { decimals, integers } => {
+                let limit = 10f64.powi(integers as i32) - 10f64.powi(-(decimals as i32));
+                format!("{:.decimals$}", f64::from(value).clamp(0.0, limit))
+                    .bytes()
+                    .map(|b| if b == b'.' { POINT } else { usize::from(b - b'0') })
+                    .collect()
+            }
+        }
+    }
+
+    /// Like [`Numbers::write`], as token ids.
+    pub fn write_ids(&self, value: f32) -> Vec<u32> {
+        self.write(value).into_iter().map(|i| self.ids[i]).collect()
+    }
+}
+
+/// Name of a bin's token.
+pub fn bin_token(bin: usize) -> String {
+    format!("<|d{bin}|>")
+}
+
+/// Reads one distribution over bins.
+pub fn read_bins(logits: &[f32], range: f64) -> Reading {
+    let bins = logits.len();
+    let width = (range / bins as f64) as f32;
+    let max = logits.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+    if !max.is_finite() || logits.iter().any(|l| l.is_nan()) {
+        return Reading::INVALID;
+    }
+    let weights: Vec<f32> = logits.iter().map(|l| (l - max).exp()).collect();
+    let total: f32 = weights.iter().sum();
+    let mut below = 0.0;
+    let mut value = range as f32;
+    for (k, w) in weights.iter().enumerate() {
+        if below + w >= total * 0.5 {
+            value = (k as f32 + (total * 0.5 - below) / w) * width;
+            break;
+        }
+        below += w;
+    }
+    let (mut error, mut near) = (0.0, 0.0);
+    // At least one bin's width, or a sharp answer of a near pixel could never be confident.
+    let tolerance = (value * CONFIDENT_WITHIN).max(width);
+    for (k, w) in weights.iter().enumerate() {
+        let distance = ((k as f32 + 0.5) * width - value).abs();
+        error += w * distance;
+        near += if distance <= tolerance { *w } else { 0.0 };
+    }
+    Reading { value, confidence: (near / total).clamp(0.0, 1.0), expected_error: error / total }
+}
+
+/// Reads a number from its digits' distributions as they were chosen one after the other.
+///
+/// Digits at places worth at most 5 % of the value do not count against the confidence.
+#[derive(Debug, Clone)]
+pub struct DigitReader {
+    format: (usize, usize),
+    chosen: Vec<usize>,
+    steps: Vec<[f32; 11]>,
+}
+
+impl DigitReader {
+    /// Starts a number with this many decimals and at most this many digits before the point.
+    pub fn new(decimals: usize, integers: usize) -> Self {
+        Self { format: (decimals, integers), chosen: Vec::new(), steps: Vec::new() }
+    }
+
+    fn point_at(&self) -> Option<usize> {
+        self.chosen.iter().position(|&c| c == POINT)
+    }
+
+    /// Whether all decimals are there.
+    pub fn done(&self) -> bool {
+        self.point_at().is_some_and(|p| self.chosen.len() == p + 1 + self.format.0)
+    }
+
+    /// Which of the 11 rows may come next.
+    fn allowed(&self) -> [bool; 11] {
+        let mut allowed = [true; 11];
+        match self.point_at() {
+            Some(_) => allowed[POINT] = false,
+            None if self.chosen.is_empty() => allowed[POINT] = false,
+            None if self.chosen.len() >= self.format.1 || self.chosen == [0] => {
+                allowed = [false; 11];
+                allowed[POINT] = true;
+            }
+            None => {}
+        }
+        allowed
+    }
+
+    /// Takes the logits of the 11 rows, chooses the likeliest allowed one and returns its index; `None` if the logits
+    /// are not numbers.
+    pub fn push(&mut self, logits: &[f32]) -> Option<usize> {
+        let allowed = self.allowed();
+        let max = (0..11).filter(|&i| allowed[i]).map(|i| logits[i]).fold(f32::NEG_INFINITY, f32::max);
+        if !max.is_finite() || logits.iter().any(|l| l.is_nan()) {
+            return None;
+        }
+        let mut p = [0f32; 11];
+        for i in 0..11 {
+            p[i] = if allowed[i] { (logits[i] - max).exp() } else { 0.0 };
+        }
+        let total: f32 = p.iter().sum();
+        p.iter_mut().for_each(|v| *v /= total);
+        let best = (0..11).fold(0, |b, i| if p[i] > p[b] { i } else { b });
+        self.chosen.push(best);
+        self.steps.push(p);
+        Some(best)
+    }
+
+    /// The number, once [`DigitReader::done`].
+    pub fn reading(&self) -> Reading {
+        let Some(point) = self.point_at().filter(|_| self.done()) else {
+            return Reading::INVALID;
+        };
+        let place = |i: usize| {
+            let exponent = if i < point { point as i32 - 1 - i as i32 } else { point as i32 - i as i32 };
+            10f32.powi(exponent)
+        };
+        let digits = || (0..self.chosen.len()).filter(|&i| i != point);
+        let value: f32 = digits().map(|i| self.chosen[i] as f32 * place(i)).sum();
+        let (mut confidence, mut error) = (1f32, 0f32);
+        for i in 0..self.chosen.len() {
+            let p = &self.steps[i];
+            let weight = if i == point { 1.0 } else { place(i) };
+            if i == point || weight > value * CONFIDENT_WITHIN {
+                confidence *= p[self.chosen[i]];
+            }
+            if i != point {
+                error += (0..10).map(|d| p[d] * d.abs_diff(self.chosen[i]) as f32).sum::<f32>() * weight;
+            }
+        }
+        Reading { value, confidence, expected_error: error }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn bins_give_median_error_and_confidence() {
+        let mut logits = vec![-30.0f32; 1000];
+        logits[400] = 5.0;
+        let r = read_bins(&logits, 1.25);
+        assert!((r.value - 400.5 * 0.00125).abs() < 1e-5, "{r:?}");
+        assert!(r.confidence > 0.999 && r.expected_error < 1e-4);
+        logits[800] = 5.0 - (3.0f32).ln();
+        let r = read_bins(&logits, 1.25);
+        assert!((r.value - 0.5).abs() < 2e-3 && (r.confidence - 0.75).abs() < 1e-3);
+        assert!((r.expected_error - 0.125).abs() < 2e-3, "{r:?}");
+        logits[3] = f32::NAN;
+        assert!(read_bins(&logits, 1.25).value.is_nan());
+    }
+
+    #[test]
+    fn digits_follow_the_grammar() {
+        let mut reader = DigitReader::new(3, 2);
+        // The point is likeliest from the start on, but a number cannot begin with it, nor have two of them.
+        let mut logits = [0f32; 11];
+        logits[POINT] = 9.0;
+        logits[4] = 5.0;
+        assert_eq!(reader.push(&logits), Some(4));
+        assert_eq!(reader.push(&logits), Some(POINT));
+        for _ in 0..3 {
+            assert!(!reader.done());
+            assert_eq!(reader.push(&logits), Some(4));
+        }
+        assert!(reader.done());
+        let r = reader.reading();
+        assert!((r.value - 4.444).abs() < 1e-5);
+        assert!(r.confidence > 0.5 && r.confidence < 1.0 && r.expected_error > 0.0);
+        assert_eq!(reader.push(&[f32::NAN; 11]), None);
+    }
+
+    #[test]
+    fn a_long_integer_part_is_closed_by_the_point() {
+        let mut reader = DigitReader::new(1, 2);
+        let nines: [f32; 11] = std::array::from_fn(|i| if i == 9 { 9.0 } else { 0.0 });
+        let chosen: Vec<_> = (0..4).map(|_| reader.push(&nines).unwrap()).collect();
+        assert_eq!(chosen, [9, 9, POINT, 9]);
+        assert!((reader.reading().value - 99.9).abs() < 1e-4);
+    }
+}

@@ -1,0 +1,295 @@
+//! From a frame to tokens: the shared prefix, and one suffix per asked pixel.
+
+use super::number::{DepthUnit, Numbers};
+use super::settings::{MeasurementPrompt, PixelReference, Settings};
+use crate::depth::SparseDepth;
+use crate::error::Result;
+use crate::vlm::config::VlmConfig;
+use crate::vlm::grid::Grid;
+use crate::vlm::prompt::positions;
+use crate::vlm::rope::Position;
+use crate::vlm::tokenizer::Tokenizer;
+use rand::seq::SliceRandom;
+use rand_chacha::rand_core::SeedableRng;
+
+/// Ids and positions of a run of tokens.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Tokens {
+    /// Token ids.
+    pub ids: Vec<u32>,
+    /// M-RoPE positions.
+    pub positions: Vec<Position>,
+}
+
+impl Tokens {
+    fn push(&mut self, id: u32, position: Position) {
+        self.ids.push(id);
+        self.positions.push(position);
+    }
+
+    /// Number of tokens.
+    pub fn len(&self) -> usize {
+        self.ids.len()
+    }
+
+    /// Whether there is none.
+    pub fn is_empty(&self) -> bool {
+        self.ids.is_empty()
+    }
+}
+
+/// Where a frame's pixels lie in the position space, and what its numbers mean.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FrameSpace {
+    /// Frame size, pixels.
+    pub width: usize,
+    /// Frame size, pixels.
+    pub height: usize,
+    /// Size of the resized image, pixels.
+    pub resized: (usize, usize),
+    /// Rows and columns of merged tokens.
+    pub merged: (usize, usize),
+    /// Position of the image's first row and column.
+    pub image_start: f32,
+    /// Position units per merged token.
+    pub position_scale: f32,
+    /// Position of the text token that follows the prefix.
+    pub next: f32,
+    /// Metres per number unit.
+    pub unit: f32,
+}
+
+/// Time offset of a measurement and of a query from the image's own time, where they stand at a pixel.
+const MEASURED_TIME: f32 = 1.0;
+const QUERY_TIME: f32 = 2.0;
+
+impl FrameSpace {
+    /// The M-RoPE position of a pixel's centre: fractional, in the units in which the image tokens count.
+    fn pixel(&self, x: f32, y: f32, time: f32) -> Position {
+        let along = |p: f32, size: usize, cells: usize| {
+            self.image_start + ((p + 0.5) / size as f32 * cells as f32 - 0.5) * self.position_scale
+        };
+        Position {
+            t: self.image_start + time,
+            h: along(y, self.height, self.merged.0),
+            w: along(x, self.width, self.merged.1),
+        }
+    }
+}
+
+/// One pixel to ask for.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Query {
+    /// Column.
+    pub x: usize,
+    /// Row.
+    pub y: usize,
+    /// The measurement that the prompt may state, metres.
+    pub measured: Option<f32>,
+    /// The guess that the pointer may state, metres.
+    pub hint: f32,
+}
+
+/// Writes the prompts of one checkpoint.
+pub struct PromptWriter {
+    settings: Settings,
+    numbers: Numbers,
+    before_image: Vec<u32>,
+    after_image: Vec<u32>,
+    /// The query's text around `{pixel}` (and `{mask}`), as pieces.
+    pieces: Vec<Piece>,
+    forced: Vec<u32>,
+    pointer: Option<u32>,
+}
+
+enum Piece {
+    Text(Vec<u32>),
+    Words(String),
+    Pointer,
+}
+
+impl PromptWriter {
+    /// Looks up every token that the template needs.
+    ///
+    /// # Errors
+    /// [`crate::Error::Tokenizer`] names a token that the vocabulary lacks.
+    pub fn new(settings: &Settings, tokenizer: &Tokenizer) -> Result<Self> {
+        let t = &settings.template;
+        let pointer = match &settings.pixel_reference {
+            PixelReference::Pointer { token } => Some(tokenizer.id(token)?),
+            PixelReference::Coordinates => None,
+        };
+        let mut writer = Self {
+            numbers: Numbers::new(settings.number, tokenizer)?,
+            before_image: tokenizer.encode(&t.before_image)?,
+            after_image: tokenizer.encode(&t.after_image)?,
+            pieces: Vec::new(),
+            forced: tokenizer.encode(t.forced())?,
+            pointer,
+            settings: settings.clone(),
+        };
+        writer.pieces = writer.split(tokenizer)?;
+        Ok(writer)
+    }
+
+    /// Text that is the same for each query is encoded once; where words depend on the pixel, the text around them is
+    /// encoded with them, since a tokenizer may join across the seam.
+    fn split(&self, tokenizer: &Tokenizer) -> Result<Vec<Piece>> {
+        let query = &self.settings.template.query;
+        let words = self.pointer.is_none() || query.contains("{mask}");
+        let (left, right) = query.split_once("{pixel}").unwrap_or((query.as_str(), ""));
+        let piece = |text: &str| -> Result<Piece> {
+            Ok(if words { Piece::Words(text.to_string()) } else { Piece::Text(tokenizer.encode(text)?) })
+        };
+        if self.pointer.is_none() {
+            return Ok(vec![Piece::Words(query.clone())]);
+        }
+        Ok(vec![piece(left)?, Piece::Pointer, piece(right)?])
+    }
+
+    /// The numbers of this checkpoint.
+    pub fn numbers(&self) -> &Numbers {
+        &self.numbers
+    }
+
+    /// The settings of this checkpoint.
+    pub fn settings(&self) -> &Settings {
+        &self.settings
+    }
+
+    /// Metres per number unit of a frame.
+    pub fn unit(&self, sparse: &SparseDepth) -> f32 {
+        match self.settings.unit {
+            DepthUnit::Metres => 1.0,
+            DepthUnit::FrameMax => sparse.max().unwrap_or(1.0),
+        }
+    }
+
+    /// The shared prefix: text, image placeholders, text, measurements; and the frame's space.
+    ///
+    /// # Errors
+    /// [`crate::Error::Argument`] if the template holds image placeholders of its own.
+    pub fn prefix(
+        &self,
+        sparse: &SparseDepth,
+        grid: Grid,
+        resized: (usize, usize),
+        config: &VlmConfig,
+        seed: u64,
+    ) -> Result<(Tokens, FrameSpace)> {
+        let merged = grid.merged(config.vision.merge_size);
+        let mut ids = self.before_image.clone();
+        ids.extend(std::iter::repeat_n(config.ids.image, merged.0 * merged.1));
+        ids.extend(&self.after_image);
+        let scale = self.settings.position_scale;
+        let walked = positions(&ids, &[grid], config, scale)?;
+        let mut tokens = Tokens { ids, positions: walked.positions };
+        let space = FrameSpace {
+            width: sparse.width(),
+            height: sparse.height(),
+            resized,
+            merged,
+            image_start: walked.image_starts[0],
+            position_scale: scale,
+            next: walked.next,
+            unit: self.unit(sparse),
+        };
+        if let MeasurementPrompt::Prefix { max } = self.settings.measurements {
+            for (x, y, depth) in choose_evenly(sparse, max, seed) {
+                let position = space.pixel(x as f32, y as f32, MEASURED_TIME);
+                for id in self.numbers.write_ids(depth / space.unit) {
+                    tokens.push(id, position);
+                }
+            }
+        }
+        Ok((tokens, space))
+    }
+
+    /// The suffix of one query, up to and including the forced words of the answer.
+    ///
+    /// # Errors
+    /// [`crate::Error::Tokenizer`] if the text cannot be encoded.
+    pub fn suffix(&self, query: &Query, space: &FrameSpace, tokenizer: &Tokenizer) -> Result<Tokens> {
+        let mut out = Tokens::default();
+        let mut p = space.next;
+        let mut text = |out: &mut Tokens, ids: &[u32]| {
+            for &id in ids {
+                out.push(id, Position::text(p));
+                p += 1.0;
+            }
+        };
+        for piece in &self.pieces {
+            match piece {
+                Piece::Text(ids) => text(&mut out, ids),
+                Piece::Words(words) => {
+                    text(&mut out, &tokenizer.encode(&self.fill_in(words, query, space))?);
+                }
+                Piece::Pointer => {
+                    let at = space.pixel(query.x as f32, query.y as f32, QUERY_TIME);
+                    match self.settings.hint {
+                        super::Hint::Linear => {
+                            for id in self.numbers.write_ids(query.hint / space.unit) {
+                                out.push(id, at);
+                            }
+                        }
+                        super::Hint::None => out.push(self.pointer.unwrap_or_default(), at),
+                    }
+                }
+            }
+        }
+        text(&mut out, &self.forced);
+        Ok(out)
+    }
+
+    fn fill_in(&self, words: &str, query: &Query, space: &FrameSpace) -> String {
+        let t = &self.settings.template;
+        let mask = match (self.settings.measurements, query.measured) {
+            (MeasurementPrompt::PerQuery, Some(depth)) => {
+                t.mask_measured.replace("{x}", &format!("{:.3}", depth / space.unit))
+            }
+            _ => t.mask_missing.clone(),
+        };
+        let along = |p: usize, size: usize, resized: usize| {
+            ((p as f32 + 0.5) * resized as f32 / size as f32) as usize
+        };
+        let pixel = t
+            .coordinates
+            .replace("{col}", &along(query.x, space.width, space.resized.0).to_string())
+            .replace("{row}", &along(query.y, space.height, space.resized.1).to_string());
+        words.replace("{mask}", &mask).replace("{pixel}", &pixel)
+    }
+}
+
+/// At most `max` measurements, spread evenly over the frame, in a shuffled order that depends on the seed alone.
+///
+/// With too many, the frame is cut into about `max` cells and each gives the measurement nearest to its centre; what
+/// is left over is filled from the rest.
+pub fn choose_evenly(sparse: &SparseDepth, max: usize, seed: u64) -> Vec<(usize, usize, f32)> {
+    let mut points: Vec<(usize, usize, f32)> = sparse.points().collect();
+    let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
+    points.shuffle(&mut rng);
+    if points.len() <= max {
+        return points;
+    }
+    let side = ((sparse.width() * sparse.height()) as f32 / max as f32).sqrt().max(1.0);
+    let cols = (sparse.width() as f32 / side).ceil() as usize;
+    let rows = (sparse.height() as f32 / side).ceil() as usize;
+    let mut best: Vec<Option<(f32, usize)>> = vec![None; cols * rows];
+    for (i, &(x, y, _)) in points.iter().enumerate() {
+        let (fx, fy) = (x as f32 / side, y as f32 / side);
+        let cell = (fy as usize).min(rows - 1) * cols + (fx as usize).min(cols - 1);
+        let off = (fx.fract() - 0.5).powi(2) + (fy.fract() - 0.5).powi(2);
+        if best[cell].is_none_or(|(b, _)| off < b) {
+            best[cell] = Some((off, i));
+        }
+    }
+    let mut taken = vec![false; points.len()];
+    for (_, i) in best.into_iter().flatten() {
+        taken[i] = true;
+    }
+    let (mut chosen, rest): (Vec<_>, Vec<_>) = points.iter().zip(&taken).partition(|(_, t)| **t);
+    chosen.extend(rest);
+    let mut chosen: Vec<_> = chosen.into_iter().map(|(p, _)| *p).take(max).collect();
+    chosen.shuffle(&mut rng);
+    chosen
+}

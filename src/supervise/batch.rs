@@ -1,0 +1,253 @@
+//! From a seed to a training batch: frames, measurements, questions and their true answers.
+
+use crate::depth::SparseDepth;
+use crate::depth::interpolate::Interpolator;
+use crate::error::Result;
+use crate::model::{SdimModel, scatter};
+use crate::query::prompt::Tokens;
+use crate::query::{MeasurementPrompt, Query};
+use crate::scenes::{RgbdFrame, SparsePattern, procedural};
+use crate::vlm::grid::Grid;
+use crate::vlm::preprocess::Pixels;
+use image::RgbImage;
+use rand::Rng;
+use rand::seq::SliceRandom;
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::SeedableRng;
+use rayon::prelude::*;
+
+/// Where the true answers come from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum LabelSource {
+    /// Measurements that are held back from the prompt: needs no ground truth (the paper's "w/ SD").
+    Sparse,
+    /// The dense ground truth (the paper's "w/ GT").
+    Dense,
+}
+
+/// What a batch is made of.
+#[derive(Debug, Clone, PartialEq, serde::Serialize, serde::Deserialize)]
+pub struct BatchConfig {
+    /// Frames per step.
+    pub frames: usize,
+    /// Questions per frame.
+    pub questions: usize,
+    /// Measurements in the prompt, at most.
+    pub prompt_points: usize,
+    /// Fewest and most measurements per frame.
+    pub points: (usize, usize),
+    /// Where labels come from.
+    pub labels: LabelSource,
+    /// Frame sizes, one drawn per step; multiples of patch x merge.
+    pub sizes: Vec<(usize, usize)>,
+}
+
+impl Default for BatchConfig {
+    fn default() -> Self {
+        Self {
+            frames: 8,
+            questions: 128,
+            prompt_points: 256,
+            points: (40, 1500),
+            labels: LabelSource::Dense,
+            sizes: vec![(256, 192), (256, 192), (224, 224), (272, 160), (320, 144), (192, 256)],
+        }
+    }
+}
+
+/// One frame's part of a batch.
+pub struct Example {
+    /// The frame as the encoder reads it.
+    pub pixels: Pixels,
+    /// Scattered measurements in number units, row-major.
+    pub scattered: Vec<f32>,
+    /// The shared prefix.
+    pub prefix: Tokens,
+    /// Suffixes with their answers' tokens (all but the last one appended), shortest first.
+    pub items: Vec<Item>,
+}
+
+/// One question with its answer.
+pub struct Item {
+    /// What the decoder reads.
+    pub tokens: Tokens,
+    /// Tokens at the end of `tokens` whose next token is supervised.
+    pub supervised: usize,
+    /// The answer, as indices of the number rows.
+    pub answer: Vec<usize>,
+    /// The answer in number units.
+    pub value: f32,
+}
+
+/// Mixes a run's seed with a counter, so that neighbouring streams share nothing.
+pub fn mix(seed: u64, counter: u64) -> u64 {
+    let mut z = seed ^ counter.wrapping_mul(0x9E37_79B9_7F4A_7C15);
+    z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+    z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+    z ^ (z >> 31)
+}
+
+/// Makes the examples of one step, in parallel; the same seed and step give the same batch.
+///
+/// # Errors
+/// Errors of the prompt writer; a frame without any return is replaced by the next seed's.
+pub fn make(model: &SdimModel, config: &BatchConfig, seed: u64, step: u64) -> Result<Vec<Example>> {
+    let size = config.sizes[(mix(seed ^ 0x51CE, step) % config.sizes.len() as u64) as usize];
+    (0..config.frames as u64)
+        .into_par_iter()
+        .map(|i| {
+            let base = mix(seed, step * config.frames as u64 + i);
+            let mut tries = 0;
+            loop {
+                match example(model, config, mix(base, tries), size) {
+                    Err(_) if tries < 8 => tries += 1,
+                    other => return other,
+                }
+            }
+        })
+        .collect()
+}
+
+fn example(model: &SdimModel, config: &BatchConfig, seed: u64, size: (usize, usize)) -> Result<Example> {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let mut frame = procedural(rng.random(), size.0, size.1)?;
+    augment(&mut frame, &mut rng);
+    let measured = measure(&frame, config, &mut rng)?;
+    let (prompted, held_back) = match config.labels {
+        LabelSource::Dense => (measured, None),
+        LabelSource::Sparse => split(&measured, &mut rng)?,
+    };
+    prompted.require_points()?;
+    let (width, height) = size;
+    let merge = model.vlm.config.vision.merge_size * model.vlm.config.vision.patch_size;
+    let grid = Grid {
+        height: height / merge * model.vlm.config.vision.merge_size,
+        width: width / merge * model.vlm.config.vision.merge_size,
+    };
+    let writer = &model.prompts;
+    let shown = match writer.settings().measurements {
+        MeasurementPrompt::Prefix { .. } => {
+            let chosen = crate::query::prompt::choose_evenly(&prompted, config.prompt_points, rng.random());
+            SparseDepth::from_points(width, height, &chosen)?
+        }
+        _ => prompted.clone(),
+    };
+    let (prefix, mut space) =
+        writer.prefix(&shown, grid, (width, height), &model.vlm.config, rng.random())?;
+    space.unit = writer.unit(&prompted);
+    let prefix = if space.unit == writer.unit(&shown) {
+        prefix
+    } else {
+        // The largest measurement was not among the chosen: say the numbers in the unit of all of them.
+        let top = prompted.points().max_by(|a, b| a.2.total_cmp(&b.2));
+        let mut chosen: Vec<_> = shown.points().collect();
+        chosen.extend(top);
+        let shown = SparseDepth::from_points(width, height, &chosen)?;
+        writer.prefix(&shown, grid, (width, height), &model.vlm.config, rng.random())?.0
+    };
+
+    let points: Vec<(f32, f32)> = prompted.points().map(|(x, y, _)| (x as f32, y as f32)).collect();
+    let values: Vec<f32> = prompted.points().map(|p| p.2).collect();
+    let interpolator = Interpolator::new(&points, width, height)?;
+    let mut items = Vec::with_capacity(config.questions);
+    for (x, y, depth) in questions(&frame, held_back.as_ref(), config.questions, &mut rng) {
+        let query =
+            Query { x, y, measured: prompted.get(x, y), hint: interpolator.at(x as f32, y as f32, &values) };
+        let mut tokens = writer.suffix(&query, &space, &model.tokenizer)?;
+        let value = depth / space.unit;
+        let answer = writer.numbers().write(value);
+        let mut p = tokens.positions.last().map_or(space.next, |p| p.t + 1.0);
+        for &digit in &answer[..answer.len() - 1] {
+            tokens.ids.push(writer.numbers().ids[digit]);
+            tokens.positions.push(crate::vlm::rope::Position::text(p));
+            p += 1.0;
+        }
+        items.push(Item { tokens, supervised: answer.len(), answer, value });
+    }
+    items.sort_by_key(|i| i.tokens.len());
+    let scattered = scatter(&prompted, width, height, space.unit);
+    Ok(Example { pixels: Pixels { resized: frame.rgb, grid }, scattered, prefix, items })
+}
+
+/// Mirrors, drops the colour or mixes the channels of a frame.
+fn augment(frame: &mut RgbdFrame, rng: &mut ChaCha8Rng) {
+    let (width, height) = (frame.rgb.width() as usize, frame.rgb.height() as usize);
+    if rng.random_bool(0.5) {
+        image::imageops::flip_horizontal_in_place(&mut frame.rgb);
+        for row in frame.depth.chunks_mut(width) {
+            row.reverse();
+        }
+    }
+    debug_assert_eq!(frame.depth.len(), width * height);
+    let mut order = [0, 1, 2];
+    if rng.random_bool(0.3) {
+        order.shuffle(rng);
+    }
+    let grey = rng.random_bool(0.08);
+    recolour(&mut frame.rgb, order, grey);
+}
+
+fn recolour(rgb: &mut RgbImage, order: [usize; 3], grey: bool) {
+    if order == [0, 1, 2] && !grey {
+        return;
+    }
+    for pixel in rgb.pixels_mut() {
+        let old = pixel.0;
+        pixel.0 = order.map(|c| old[c]);
+        if grey {
+            let mean = (old.iter().map(|&v| u32::from(v)).sum::<u32>() / 3) as u8;
+            pixel.0 = [mean; 3];
+        }
+    }
+}
+
+/// Measurements of a frame: a pattern and a number of points drawn at random; some frames get sensor noise.
+fn measure(frame: &RgbdFrame, config: &BatchConfig, rng: &mut ChaCha8Rng) -> Result<SparseDepth> {
+    let (width, height) = (frame.rgb.width() as usize, frame.rgb.height() as usize);
+    let (low, high) = config.points;
+    let points = (low as f32 * (high as f32 / low as f32).powf(rng.random::<f32>())) as usize;
+    let pattern = match rng.random_range(0..10) {
+        0 => SparsePattern::Sfm,
+        1 | 2 => SparsePattern::Lidar { lines: rng.random_range(4..24) },
+        _ => SparsePattern::Uniform,
+    };
+    let exact = pattern.sample(&frame.rgb, &frame.depth, width, height, points, rng)?;
+    if rng.random_bool(0.75) {
+        return Ok(exact);
+    }
+    let noise = 0.02 * rng.random::<f32>();
+    let noisy: Vec<_> = exact
+        .points()
+        .map(|(x, y, d)| (x, y, d * (1.0 + noise * (rng.random::<f32>() + rng.random::<f32>() - 1.0))))
+        .collect();
+    SparseDepth::from_points(width, height, &noisy)
+}
+
+/// Holds 30 % of the measurements back as labels.
+fn split(measured: &SparseDepth, rng: &mut ChaCha8Rng) -> Result<(SparseDepth, Option<SparseDepth>)> {
+    let (held, shown): (Vec<_>, Vec<_>) = measured.points().partition(|_| rng.random_bool(0.3));
+    let (w, h) = (measured.width(), measured.height());
+    Ok((SparseDepth::from_points(w, h, &shown)?, Some(SparseDepth::from_points(w, h, &held)?)))
+}
+
+/// Pixels to ask and their true depths.
+fn questions(
+    frame: &RgbdFrame,
+    held_back: Option<&SparseDepth>,
+    count: usize,
+    rng: &mut ChaCha8Rng,
+) -> Vec<(usize, usize, f32)> {
+    let width = frame.rgb.width() as usize;
+    let known: Vec<(usize, usize, f32)> = match held_back {
+        Some(sparse) => sparse.points().collect(),
+        None => (0..frame.depth.len())
+            .filter(|&i| frame.depth[i].is_finite())
+            .map(|i| (i % width, i / width, frame.depth[i]))
+            .collect(),
+    };
+    if known.is_empty() {
+        return Vec::new();
+    }
+    (0..count).map(|_| known[rng.random_range(0..known.len())]).collect()
+}

@@ -1,0 +1,58 @@
+//! A quick look at a model while it trains: relative error on held-out procedural scenes against interpolation.
+
+use super::batch::mix;
+use crate::depth::interpolate;
+use crate::error::Result;
+use crate::model::SdimModel;
+use crate::query::{Query, ask};
+use crate::scenes::{procedural, sample_points};
+use rand::Rng;
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::SeedableRng;
+
+/// Mean over scenes of mean |error| / mean depth, at pixels drawn at random.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct HeldOut {
+    /// The model's answers as they are, without alignment.
+    pub model: f32,
+    /// Delaunay-linear interpolation of the same measurements.
+    pub linear: f32,
+}
+
+/// Pixels asked per scene.
+const PIXELS: usize = 1024;
+
+/// Evaluates on the scenes of these seeds, which training never draws if `first_seed` is below 2^32.
+///
+/// # Errors
+/// Errors of the scenes and the model.
+pub fn evaluate(model: &SdimModel, scenes: u64, points: usize, first_seed: u64) -> Result<HeldOut> {
+    let mut sum = HeldOut { model: 0.0, linear: 0.0 };
+    for seed in first_seed..first_seed + scenes {
+        let frame = procedural(seed, 256, 192)?;
+        let sparse = sample_points(&frame.depth, 256, 192, points, seed)?;
+        let linear = interpolate::linear(&sparse)?;
+        let mut rng = ChaCha8Rng::seed_from_u64(mix(seed, 1));
+        let mut queries = Vec::new();
+        while queries.len() < PIXELS {
+            let (x, y) = (rng.random_range(0..256), rng.random_range(0..192));
+            if frame.depth[y * 256 + x].is_finite() && sparse.get(x, y).is_none() {
+                queries.push(Query { x, y, measured: None, hint: linear[y * 256 + x] });
+            }
+        }
+        let (pixels, scattered) = model.preprocess(&frame.rgb, &sparse)?;
+        let tokens = model.encode(&pixels, &scattered)?;
+        let prefix = model.read_prefix(&pixels, &tokens, &sparse)?;
+        let answers = ask(model, &prefix, &queries, &mut |_| true)?;
+        let (mut off, mut off_linear, mut depth) = (0.0, 0.0, 0.0);
+        for (q, a) in queries.iter().zip(answers) {
+            let truth = frame.depth[q.y * 256 + q.x];
+            off += (a.value - truth).abs();
+            off_linear += (q.hint - truth).abs();
+            depth += truth;
+        }
+        sum.model += off / depth / scenes as f32;
+        sum.linear += off_linear / depth / scenes as f32;
+    }
+    Ok(sum)
+}

@@ -1,0 +1,206 @@
+//! The loss of one answer: cross-entropy on its tokens, plus L1 on the depth that they are expected to say.
+
+use crate::error::Result;
+use candle_core::{CpuStorage, CustomOp1, DType, Layout, Shape, Tensor};
+use rayon::prelude::*;
+use std::sync::Mutex;
+
+/// Weights and blur of the loss on number tokens.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct BinLoss {
+    /// Upper end of the last bin, in number units.
+    pub range: f64,
+    /// Standard deviation of the blurred target at depth 0, in number units.
+    pub blur: f32,
+    /// What is added to it per unit of depth.
+    pub blur_slope: f32,
+    /// Weight of the L1 of the mean against the cross-entropy.
+    pub l1: f32,
+}
+
+/// Mean loss over rows and its parts.
+#[derive(Debug, Clone)]
+pub struct LossParts {
+    /// Scalar, differentiable.
+    pub total: Tensor,
+    /// Mean absolute difference between the expected and the true number, in number units.
+    pub l1: f32,
+}
+
+struct BinLossOp {
+    config: BinLoss,
+    targets: Vec<f32>,
+    gradient: Mutex<Vec<f32>>,
+    l1: std::sync::Arc<Mutex<f32>>,
+}
+
+impl BinLossOp {
+    /// Loss and absolute error of one row; its gradient goes to `grad`.
+    fn row(&self, logits: &[f32], target: f32, grad: &mut [f32]) -> (f64, f64) {
+        let bins = logits.len();
+        let width = self.config.range as f32 / bins as f32;
+        let centre = |k: usize| (k as f32 + 0.5) * width;
+        let target = target.clamp(0.5 * width, self.config.range as f32 - 0.5 * width);
+        let sigma = (self.config.blur + self.config.blur_slope * target).max(0.5 * width);
+
+        let max = logits.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+        let mut total = 0.0;
+        for (g, l) in grad.iter_mut().zip(logits) {
+            *g = (l - max).exp();
+            total += *g;
+        }
+        let mean: f32 = grad.iter().enumerate().map(|(k, p)| p / total * centre(k)).sum();
+        let sign = (mean - target).signum() * self.config.l1;
+
+        let blurred = |k: usize| (-0.5 * ((centre(k) - target) / sigma).powi(2)).exp();
+        let reach = (5.0 * sigma / width).ceil() as usize + 1;
+        let middle = (target / width) as usize;
+        let (from, to) = (middle.saturating_sub(reach), (middle + reach + 1).min(bins));
+        let mass: f32 = (from..to).map(blurred).sum();
+        let log_total = total.ln() + max;
+
+        let mut loss = 0f64;
+        for k in 0..bins {
+            let p = grad[k] / total;
+            // d|mean - t|/dlogit = sign * p * (centre - mean)
+            grad[k] = p + sign * p * (centre(k) - mean);
+        }
+        for k in from..to {
+            let q = blurred(k) / mass;
+            grad[k] -= q;
+            loss += f64::from(q) * f64::from(log_total - logits[k]);
+        }
+        let error = f64::from((mean - target).abs());
+        (loss + f64::from(self.config.l1) * error, error)
+    }
+}
+
+impl CustomOp1 for BinLossOp {
+    fn name(&self) -> &'static str {
+        "bin-loss"
+    }
+
+    fn cpu_fwd(&self, storage: &CpuStorage, layout: &Layout) -> candle_core::Result<(CpuStorage, Shape)> {
+        let (rows, bins) = layout.shape().dims2()?;
+        let Some((start, end)) = layout.contiguous_offsets() else {
+            candle_core::bail!("bin-loss wants contiguous logits");
+        };
+        let logits = &storage.as_slice::<f32>()?[start..end];
+        let mut gradient = vec![0f32; rows * bins];
+        let sums: Vec<(f64, f64)> = gradient
+            .par_chunks_mut(bins)
+            .zip(logits.par_chunks(bins))
+            .zip(&self.targets)
+            .map(|((grad, row), &target)| self.row(row, target, grad))
+            .collect();
+        let scale = 1.0 / rows as f32;
+        gradient.par_iter_mut().for_each(|g| *g *= scale);
+        let (loss, error) = sums.iter().fold((0.0, 0.0), |a, s| (a.0 + s.0, a.1 + s.1));
+        if let (Ok(mut stash), Ok(mut l1)) = (self.gradient.lock(), self.l1.lock()) {
+            *stash = gradient;
+            *l1 = (error / rows as f64) as f32;
+        }
+        Ok((CpuStorage::F32(vec![(loss / rows as f64) as f32]), Shape::from(())))
+    }
+
+    fn bwd(&self, arg: &Tensor, _res: &Tensor, grad: &Tensor) -> candle_core::Result<Option<Tensor>> {
+        let stash = self.gradient.lock().map(|mut g| std::mem::take(&mut *g)).unwrap_or_default();
+        let local = Tensor::from_vec(stash, arg.shape(), arg.device())?;
+        Ok(Some(local.broadcast_mul(grad)?))
+    }
+}
+
+/// Loss of number-token logits `[rows, bins]` against true numbers in number units.
+///
+/// # Errors
+/// [`crate::Error::Tensors`] on mismatched shapes.
+pub fn bins(logits: &Tensor, targets: Vec<f32>, config: BinLoss) -> Result<LossParts> {
+    let l1 = std::sync::Arc::new(Mutex::new(0.0));
+    let op = BinLossOp { config, targets, gradient: Mutex::default(), l1: l1.clone() };
+    let total = logits.contiguous()?.apply_op1(op)?;
+    let l1 = l1.lock().map(|v| *v).unwrap_or(f32::NAN);
+    Ok(LossParts { total, l1 })
+}
+
+/// Loss of digit logits `[rows, 11]`: cross-entropy of each row's digit, plus L1 on the expected number.
+///
+/// `chosen` is the true index of each row; `place` is the worth of a row's digit (0 for the decimal point), `number` the
+/// number that the row belongs to, of `numbers`.
+///
+/// # Errors
+/// [`crate::Error::Tensors`] on mismatched shapes.
+pub fn digits(
+    logits: &Tensor,
+    chosen: &[u32],
+    place: &[f32],
+    number: &[u32],
+    numbers: usize,
+    l1_weight: f64,
+) -> Result<LossParts> {
+    let (rows, _) = logits.dims2()?;
+    let device = logits.device();
+    let log_p = candle_nn::ops::log_softmax(logits, 1)?;
+    let chosen_at = Tensor::from_vec(chosen.to_vec(), (rows, 1), device)?;
+    let cross_entropy = log_p.gather(&chosen_at, 1)?.mean_all()?.neg()?;
+    let face: Vec<f32> = (0..11).map(|d| if d < 10 { d as f32 } else { 0.0 }).collect();
+    let expected = log_p.exp()?.broadcast_mul(&Tensor::from_vec(face, (1, 11), device)?)?.sum(1)?;
+    let truth: Vec<f32> = chosen.iter().map(|&c| if c < 10 { c as f32 } else { 0.0 }).collect();
+    let off = ((expected - Tensor::from_vec(truth, rows, device)?)?
+        * Tensor::from_vec(place.to_vec(), rows, device)?)?;
+    let index = Tensor::from_vec(number.to_vec(), rows, device)?;
+    let sums = Tensor::zeros(numbers, DType::F32, device)?.index_add(&index, &off, 0)?;
+    let l1 = sums.abs()?.mean_all()?;
+    let value = l1.to_scalar::<f32>()?;
+    Ok(LossParts { total: (cross_entropy + (l1 * l1_weight)?)?, l1: value })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use candle_core::{Device, Var};
+
+    #[test]
+    fn bin_gradient_matches_finite_differences() {
+        let values: Vec<f32> = (0..2 * 20).map(|i| ((i * 37 % 11) as f32 - 5.0) * 0.3).collect();
+        let config = BinLoss { range: 1.0, blur: 0.02, blur_slope: 0.05, l1: 2.0 };
+        let targets = vec![0.31, 0.77];
+        let loss = |v: &[f32]| -> f32 {
+            let t = Tensor::from_vec(v.to_vec(), (2, 20), &Device::Cpu).unwrap();
+            bins(&t, targets.clone(), config).unwrap().total.to_scalar().unwrap()
+        };
+        let var = Var::from_vec(values.clone(), (2, 20), &Device::Cpu).unwrap();
+        let total = bins(&var, targets.clone(), config).unwrap().total;
+        let grads = total.backward().unwrap();
+        let grad: Vec<f32> = grads.get(&var).unwrap().flatten_all().unwrap().to_vec1().unwrap();
+        for i in 0..values.len() {
+            let (mut up, mut down) = (values.clone(), values.clone());
+            up[i] += 1e-2;
+            down[i] -= 1e-2;
+            let numeric = (loss(&up) - loss(&down)) / 2e-2;
+            assert!((numeric - grad[i]).abs() < 2e-3, "{i}: {numeric} vs {}", grad[i]);
+        }
+    }
+
+    #[test]
+    fn a_sure_right_answer_costs_less_than_a_sure_wrong_one() {
+        let config = BinLoss { range: 1.0, blur: 0.01, blur_slope: 0.0, l1: 2.0 };
+        let at = |k: usize| {
+            let mut v = vec![0f32; 100];
+            v[k] = 8.0;
+            let t = Tensor::from_vec(v, (1, 100), &Device::Cpu).unwrap();
+            bins(&t, vec![0.405], config).unwrap().total.to_scalar::<f32>().unwrap()
+        };
+        assert!(at(40) < at(60) && at(60) < at(90));
+    }
+
+    #[test]
+    fn digits_are_supervised_by_place() {
+        let row = |d: usize| (0..11).map(|i| if i == d { 20f32 } else { 0.0 }).collect::<Vec<_>>();
+        let logits: Vec<f32> = [row(4), row(10), row(2)].concat();
+        let logits = Tensor::from_vec(logits, (3, 11), &Device::Cpu).unwrap();
+        let right = digits(&logits, &[4, 10, 2], &[1.0, 0.0, 0.1], &[0, 0, 0], 1, 1.0).unwrap();
+        assert!(right.total.to_scalar::<f32>().unwrap() < 1e-3 && right.l1 < 1e-3);
+        let wrong = digits(&logits, &[5, 10, 2], &[1.0, 0.0, 0.1], &[0, 0, 0], 1, 1.0).unwrap();
+        assert!((wrong.l1 - 1.0).abs() < 1e-3);
+    }
+}

@@ -1,0 +1,94 @@
+//! Checkpoints on disk: the published one, and the trainer's state to resume from.
+
+use super::init::FreshFiles;
+use super::optimiser::Parameters;
+use crate::error::{Error, Result};
+use candle_core::{DType, Device, Tensor};
+use std::collections::HashMap;
+use std::path::Path;
+
+fn write(path: &Path, bytes: &[u8]) -> Result<()> {
+    // A reader never sees half a file, and a crash leaves the old one.
+    let partial = path.with_extension("partial");
+    std::fs::write(&partial, bytes).map_err(Error::io(&partial))?;
+    std::fs::rename(&partial, path).map_err(Error::io(path))
+}
+
+fn serialise(path: &Path, tensors: &HashMap<String, Tensor>) -> Result<Vec<u8>> {
+    safetensors::serialize(tensors, None)
+        .map_err(|e| Error::format(path, e.to_string(), "tensors that safetensors can hold"))
+}
+
+/// Writes a checkpoint directory that [`crate::model::SdimModel::load`] reads: the averaged weights as bf16.
+///
+/// # Errors
+/// [`Error::Io`], [`Error::Tensors`].
+pub fn publish(dir: &Path, files: &FreshFiles, parameters: &Parameters) -> Result<()> {
+    std::fs::create_dir_all(dir).map_err(Error::io(dir))?;
+    let mut tensors = HashMap::new();
+    for (name, tensor) in parameters.averages()? {
+        tensors.insert(name, tensor.to_dtype(DType::BF16)?);
+    }
+    let path = dir.join("model.safetensors");
+    write(&path, &serialise(&path, &tensors)?)?;
+    for (name, text) in [
+        ("config.json", &files.config),
+        ("preprocessor_config.json", &files.preprocessor),
+        ("sdim.json", &files.settings),
+        ("tokenizer.json", &files.tokenizer),
+    ] {
+        write(&dir.join(name), text.as_bytes())?;
+    }
+    Ok(())
+}
+
+/// Writes `trainer.safetensors`: values, moments and averages in f32, and the number of finished steps.
+///
+/// # Errors
+/// [`Error::Io`], [`Error::Tensors`].
+pub fn save_state(dir: &Path, parameters: &Parameters, step: usize) -> Result<()> {
+    std::fs::create_dir_all(dir).map_err(Error::io(dir))?;
+    let mut tensors = HashMap::new();
+    for (name, p) in &parameters.all {
+        for (part, data) in [("value", p.values()), ("m", &p.m), ("v", &p.v), ("average", &p.average)] {
+            let tensor = Tensor::from_slice(data, p.var.shape(), &Device::Cpu)?;
+            tensors.insert(format!("{part}/{name}"), tensor);
+        }
+    }
+    tensors.insert("step".into(), Tensor::new(&[step as u32], &Device::Cpu)?);
+    let path = dir.join("trainer.safetensors");
+    write(&path, &serialise(&path, &tensors)?)
+}
+
+/// Reads what [`save_state`] wrote and returns the number of finished steps.
+///
+/// # Errors
+/// [`Error::Io`], [`Error::Format`] on a damaged file, [`Error::Tensor`] if it belongs to another model.
+pub fn load_state(dir: &Path, parameters: &mut Parameters) -> Result<usize> {
+    let path = dir.join("trainer.safetensors");
+    let file = path.display().to_string();
+    let bytes = std::fs::read(&path).map_err(Error::io(&path))?;
+    let state = candle_core::safetensors::load_buffer(&bytes, &Device::Cpu)
+        .map_err(|e| Error::format(&path, e.to_string(), "a trainer state"))?;
+    let missing = |name: &str, expected: String| Error::Tensor {
+        file: file.clone(),
+        name: name.to_string(),
+        found: "missing or of another shape".into(),
+        expected,
+    };
+    for (name, p) in &mut parameters.all {
+        let read = |part: &str| -> Result<Vec<f32>> {
+            match state.get(&format!("{part}/{name}")) {
+                Some(t) if t.shape() == p.var.shape() => Ok(t.flatten_all()?.to_vec1()?),
+                _ => Err(missing(&format!("{part}/{name}"), format!("{:?}", p.var.shape()))),
+            }
+        };
+        let (values, average) = (read("value")?, read("average")?);
+        (p.m, p.v) = (read("m")?, read("v")?);
+        p.set(&values, &average)?;
+    }
+    match state.get("step").map(|t| t.to_vec1::<u32>()) {
+        Some(Ok(step)) if step.len() == 1 => Ok(step[0] as usize),
+        _ => Err(missing("step", "one u32".into())),
+    }
+}

@@ -1,0 +1,64 @@
+//! Keys and values of tokens that were already read. A cache is an argument of a forward pass, never a field of a layer.
+
+use crate::error::Result;
+use candle_core::Tensor;
+
+/// Keys and values per layer, of `items` sequences of equal length that do not see each other.
+///
+/// A prompt is one item; a batch of query suffixes is one item per query. The number of cached tokens is not the next
+/// position: see [`crate::vlm::prompt`].
+#[derive(Debug, Clone)]
+pub struct KvCache {
+    items: usize,
+    len: usize,
+    layers: Vec<Option<(Tensor, Tensor)>>,
+}
+
+impl KvCache {
+    /// An empty cache for a decoder of `layers` layers.
+    pub fn new(layers: usize, items: usize) -> Self {
+        Self { items, len: 0, layers: vec![None; layers] }
+    }
+
+    /// Sequences.
+    pub fn items(&self) -> usize {
+        self.items
+    }
+
+    /// Tokens held for each sequence.
+    pub fn len(&self) -> usize {
+        self.len
+    }
+
+    /// Whether no token is held.
+    pub fn is_empty(&self) -> bool {
+        self.len == 0
+    }
+
+    /// Keys and values of a layer, each `[items * len, kv_heads * head_dim]`; `None` while empty.
+    pub fn layer(&self, layer: usize) -> Option<(&Tensor, &Tensor)> {
+        self.layers.get(layer)?.as_ref().map(|(k, v)| (k, v))
+    }
+
+    /// Appends `[items * new, width]` to each sequence of a layer and returns all of its keys and values.
+    /// [`KvCache::advance`] makes the new length count, once all layers have appended.
+    pub(crate) fn append(&mut self, layer: usize, k: &Tensor, v: &Tensor) -> Result<(Tensor, Tensor)> {
+        let joined = match &self.layers[layer] {
+            None => (k.clone(), v.clone()),
+            Some((old_k, old_v)) => (self.join(old_k, k)?, self.join(old_v, v)?),
+        };
+        self.layers[layer] = Some(joined.clone());
+        Ok(joined)
+    }
+
+    fn join(&self, old: &Tensor, new: &Tensor) -> Result<Tensor> {
+        let width = old.dim(1)?;
+        let old = old.reshape((self.items, (), width))?;
+        let new = new.reshape((self.items, (), width))?;
+        Ok(Tensor::cat(&[old, new], 1)?.reshape(((), width))?)
+    }
+
+    pub(crate) fn advance(&mut self, tokens: usize) {
+        self.len += tokens;
+    }
+}

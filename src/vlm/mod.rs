@@ -1,0 +1,88 @@
+//! Qwen2.5-VL on candle: preprocessing, vision encoder, decoder, cache, tokenizer, generation.
+//!
+//! Nothing here knows of depth. Tokens are rows of `[tokens, width]` tensors; there is no batch axis and no padding.
+
+pub mod cache;
+pub mod config;
+pub mod decoder;
+pub mod generate;
+pub mod grid;
+pub mod linear;
+pub mod patch_embed;
+pub mod preprocess;
+pub mod prompt;
+pub mod resize;
+pub mod rope;
+pub mod tokenizer;
+pub mod vision;
+pub mod weights;
+
+use crate::error::Result;
+use cache::KvCache;
+use candle_core::{DType, Tensor};
+use config::VlmConfig;
+use decoder::{Context, Decoder};
+use grid::Grid;
+use rope::{Position, RopeLayout};
+use vision::VisionTower;
+use weights::Weights;
+
+/// The published model: vision encoder and decoder.
+pub struct QwenVl {
+    /// Sizes and special tokens.
+    pub config: VlmConfig,
+    /// `visual.*`
+    pub vision: VisionTower,
+    /// `model.*` and the head.
+    pub decoder: Decoder,
+}
+
+impl QwenVl {
+    /// Builds both towers. The caller ends with [`Weights::finish`] when everything that reads them is built.
+    ///
+    /// # Errors
+    /// As [`Weights::get`].
+    pub fn new(config: VlmConfig, weights: &Weights, layout: RopeLayout) -> Result<Self> {
+        let vision = VisionTower::new(&config.vision, weights)?;
+        let decoder = Decoder::new(&config.text, weights, layout)?;
+        Ok(Self { config, vision, decoder })
+    }
+
+    /// Image tokens `[tokens, hidden]` of preprocessed patches `[patches, patch_len]`.
+    ///
+    /// # Errors
+    /// [`crate::Error::Tensors`] if the rows are not those of the grids.
+    pub fn encode(&self, patches: &Tensor, grids: &[Grid]) -> Result<Tensor> {
+        self.vision.encode(&self.vision.patch_embed.forward(patches)?, grids)
+    }
+
+    /// Embeds a prompt and puts the image tokens in the places of the placeholders, in order: `[ids, hidden]`.
+    ///
+    /// # Errors
+    /// [`crate::Error::Argument`] on an id outside the vocabulary; [`crate::Error::Tensors`] if the counts differ.
+    pub fn embed_prompt(&self, ids: &[u32], image_tokens: &Tensor) -> Result<Tensor> {
+        let text = self.decoder.embed(ids)?;
+        let (mut parts, mut i, mut used) = (Vec::new(), 0, 0);
+        while i < ids.len() {
+            let is_image = ids[i] == self.config.ids.image;
+            let run = ids[i..].iter().take_while(|&&id| (id == self.config.ids.image) == is_image).count();
+            if is_image {
+                parts.push(image_tokens.narrow(0, used, run)?.to_dtype(DType::F32)?);
+                used += run;
+            } else {
+                parts.push(text.narrow(0, i, run)?);
+            }
+            i += run;
+        }
+        Ok(Tensor::cat(&parts, 0)?)
+    }
+
+    /// Reads tokens into a cache and returns their hidden states before the final norm, `[tokens, hidden]`.
+    ///
+    /// # Errors
+    /// [`crate::Error::Tensors`] on mismatched shapes.
+    pub fn prefill(&self, embedded: &Tensor, positions: &[Position], cache: &mut KvCache) -> Result<Tensor> {
+        let table = self.decoder.rope().table(positions, embedded.device())?;
+        self.decoder.forward(embedded, &table, Context::Cached { shared: None, own: cache }, None)
+    }
+}

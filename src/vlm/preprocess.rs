@@ -1,0 +1,188 @@
+//! From an RGB frame to the rows of the patch embedding, as the published image processor does it.
+
+use super::config::Node;
+use super::grid::Grid;
+use super::resize;
+use crate::error::{Error, Result};
+use candle_core::{Device, Tensor};
+use image::RgbImage;
+use rayon::prelude::*;
+use serde_json::Value;
+
+/// `preprocessor_config.json`.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PreprocessorConfig {
+    /// Fewest pixels of the resized image.
+    pub min_pixels: usize,
+    /// Most pixels of the resized image.
+    pub max_pixels: usize,
+    /// Side of a patch, pixels.
+    pub patch_size: usize,
+    /// Frames per patch.
+    pub temporal_patch_size: usize,
+    /// Patches per side of a merged token.
+    pub merge_size: usize,
+    /// Mean of each channel, of values in 0..1.
+    pub image_mean: [f32; 3],
+    /// Standard deviation of each channel.
+    pub image_std: [f32; 3],
+}
+
+/// An image as the encoder reads it.
+#[derive(Debug, Clone)]
+pub struct Pixels {
+    /// The resized frame, 8 bit.
+    pub resized: RgbImage,
+    /// Its patches.
+    pub grid: Grid,
+}
+
+impl PreprocessorConfig {
+    /// Reads `preprocessor_config.json`; both `min_pixels`/`max_pixels` and `size.shortest_edge`/`size.longest_edge`.
+    ///
+    /// # Errors
+    /// [`Error::Config`] names the key.
+    pub fn from_json(file: &str, json: &Value) -> Result<Self> {
+        let n = Node::new(file, "", json);
+        let size = json.get("size").cloned().unwrap_or(Value::Null);
+        let size = Node::new(file, "size", &size);
+        let limit = |key: &str, edge: &str, default: usize| {
+            if n.absent(key) { size.size_or(edge, default) } else { n.size(key) }
+        };
+        let channels = |key: &str, default: [f32; 3]| -> Result<[f32; 3]> {
+            let Some(value) = json.get(key) else { return Ok(default) };
+            let parsed: Option<[f32; 3]> = serde_json::from_value(value.clone()).ok();
+            parsed
+                .filter(|v| v.iter().all(|x| x.is_finite() && *x > 0.0))
+                .ok_or_else(|| Error::config(file, key, value.to_string(), "three positive numbers"))
+        };
+        let config = Self {
+            min_pixels: limit("min_pixels", "shortest_edge", 56 * 56)?,
+            max_pixels: limit("max_pixels", "longest_edge", 28 * 28 * 1280)?,
+            patch_size: n.size_or("patch_size", 14)?,
+            temporal_patch_size: n.size_or("temporal_patch_size", 2)?,
+            merge_size: n.size_or("merge_size", 2)?,
+            image_mean: channels("image_mean", [0.48145466, 0.4578275, 0.40821073])?,
+            image_std: channels("image_std", [0.26862954, 0.261_302_6, 0.275_777_1])?,
+        };
+        if config.min_pixels > config.max_pixels {
+            let found = config.min_pixels.to_string();
+            return Err(Error::config(file, "min_pixels", found, "at most max_pixels"));
+        }
+        Ok(config)
+    }
+
+    /// Width and height that the processor resizes a frame to: multiples of patch x merge, close to the aspect ratio,
+    /// within the limits of pixels. Ties round to even, as Python's `round` does.
+    ///
+    /// # Errors
+    /// [`Error::ImageSize`] on an empty side or an aspect ratio over 200.
+    pub fn smart_resize(&self, width: usize, height: usize) -> Result<(usize, usize)> {
+        if width == 0 || height == 0 || width.max(height) > 200 * width.min(height) {
+            let reason = "expected non-empty sides and an aspect ratio of at most 200".into();
+            return Err(Error::ImageSize { width, height, reason });
+        }
+        let factor = self.patch_size * self.merge_size;
+        let (f, h, w) = (factor as f64, height as f64, width as f64);
+        let even = |v: f64| (v / f).round_ties_even() as usize * factor;
+        let (hb, wb) = (even(h), even(w));
+        if hb * wb > self.max_pixels {
+            let beta = (h * w / self.max_pixels as f64).sqrt();
+            let down = |v: f64| ((v / beta / f).floor() as usize * factor).max(factor);
+            Ok((down(w), down(h)))
+        } else if hb * wb < self.min_pixels {
+            let beta = (self.min_pixels as f64 / (h * w)).sqrt();
+            let up = |v: f64| (v * beta / f).ceil() as usize * factor;
+            Ok((up(w), up(h)))
+        } else {
+            Ok((wb, hb))
+        }
+    }
+
+    /// Resizes a frame for the encoder.
+    ///
+    /// # Errors
+    /// As [`PreprocessorConfig::smart_resize`].
+    pub fn resize(&self, rgb: &RgbImage) -> Result<Pixels> {
+        let (width, height) = self.smart_resize(rgb.width() as usize, rgb.height() as usize)?;
+        Ok(Pixels {
+            resized: resize::bicubic(rgb, width, height),
+            grid: Grid { height: height / self.patch_size, width: width / self.patch_size },
+        })
+    }
+
+    /// Value of an 8-bit sample as the encoder sees it.
+    pub fn normalise(&self, value: u8, channel: usize) -> f32 {
+        // The reference rescales in f64 and rounds to f32 before it subtracts the mean.
+        let unit = (f64::from(value) * (1.0 / 255.0)) as f32;
+        (unit - self.image_mean[channel]) / self.image_std[channel]
+    }
+
+    /// Rows of the patch embedding, `[patches, 3 * frames * side * side]`, f32: merge blocks row-major, four patches of
+    /// a block in a row; inside a row channel, frame (repeated), y, x.
+    ///
+    /// # Errors
+    /// [`Error::Tensors`] if the device refuses the tensor.
+    pub fn patches(&self, pixels: &Pixels, device: &Device) -> Result<Tensor> {
+        let (p, t) = (self.patch_size, self.temporal_patch_size);
+        let len = 3 * t * p * p;
+        let table: Vec<[f32; 256]> =
+            (0..3).map(|c| std::array::from_fn(|v| self.normalise(v as u8, c))).collect();
+        let width = pixels.resized.width() as usize;
+        let raw = pixels.resized.as_raw();
+        let order = pixels.grid.patch_positions(self.merge_size);
+        let mut rows = vec![0f32; order.len() * len];
+        rows.par_chunks_mut(len).zip(&order).for_each(|(row, &(py, px))| {
+            for (plane, dst) in row.chunks_exact_mut(p * p).enumerate() {
+                let channel = plane / t;
+                for (i, d) in dst.iter_mut().enumerate() {
+                    let (y, x) = (py * p + i / p, px * p + i % p);
+                    *d = table[channel][raw[(y * width + x) * 3 + channel] as usize];
+                }
+            }
+        });
+        Ok(Tensor::from_vec(rows, (order.len(), len), device)?)
+    }
+
+    /// The normalised frame `[height, width, 3]`, f32: what the fusion block convolves.
+    ///
+    /// # Errors
+    /// [`Error::Tensors`] if the device refuses the tensor.
+    pub fn image(&self, pixels: &Pixels, device: &Device) -> Result<Tensor> {
+        let values: Vec<f32> =
+            pixels.resized.as_raw().iter().enumerate().map(|(i, &v)| self.normalise(v, i % 3)).collect();
+        let (w, h) = (pixels.resized.width() as usize, pixels.resized.height() as usize);
+        Ok(Tensor::from_vec(values, (h, w, 3), device)?)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn published() -> PreprocessorConfig {
+        let json = serde_json::json!({"min_pixels": 3136, "max_pixels": 12845056});
+        PreprocessorConfig::from_json("test", &json).unwrap()
+    }
+
+    #[test]
+    fn ties_go_to_even() {
+        let c = published();
+        for (side, want) in [(70, 56), (126, 112), (238, 224), (518, 504), (1078, 1064)] {
+            assert_eq!(c.smart_resize(side, 280).unwrap(), (want, 280), "side {side}");
+        }
+    }
+
+    #[test]
+    fn limits_and_ratio() {
+        let mut c = published();
+        assert_eq!(c.smart_resize(640, 480).unwrap(), (644, 476));
+        assert!(matches!(c.smart_resize(2010, 10), Err(Error::ImageSize { .. })));
+        assert!(matches!(c.smart_resize(0, 10), Err(Error::ImageSize { .. })));
+        let (w, h) = c.smart_resize(5, 700).unwrap();
+        assert!(w >= 28 && w * h >= 3136);
+        c.max_pixels = 100 * 28 * 28;
+        let (w, h) = c.smart_resize(1920, 1080).unwrap();
+        assert!(w * h <= c.max_pixels && w % 28 == 0 && h % 28 == 0);
+    }
+}

@@ -1,0 +1,133 @@
+//! Named tensors of a checkpoint: strict shapes, published or in-memory names, and a record of what was read.
+
+use crate::error::{Error, Result};
+use candle_core::{DType, Device, Tensor};
+use std::cell::RefCell;
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::path::Path;
+
+/// The tensors of a checkpoint under their published names.
+///
+/// Every read checks the shape and is recorded, so that [`Weights::finish`] can tell missing and unread tensors.
+pub struct Weights {
+    file: String,
+    tensors: HashMap<String, Tensor>,
+    read: RefCell<BTreeSet<String>>,
+    missing: RefCell<BTreeMap<String, Vec<usize>>>,
+}
+
+/// Maps an in-memory name of `transformers` >= 4.52 to the published one.
+pub fn published_name(name: &str) -> String {
+    if let Some(rest) = name.strip_prefix("model.visual.") {
+        format!("visual.{rest}")
+    } else if let Some(rest) = name.strip_prefix("model.language_model.") {
+        format!("model.{rest}")
+    } else {
+        name.to_string()
+    }
+}
+
+impl Weights {
+    /// Tensors that are already in memory (the trainer's variables, tests). `file` is for messages.
+    pub fn from_tensors(file: &str, tensors: HashMap<String, Tensor>) -> Self {
+        Self { file: file.to_string(), tensors, read: RefCell::default(), missing: RefCell::default() }
+    }
+
+    /// Reads safetensors bytes and converts each tensor to `dtype` on `device`.
+    ///
+    /// # Errors
+    /// [`Error::Format`] if the bytes are truncated or no safetensors; [`Error::Tensor`] on an integer tensor.
+    pub fn from_bytes(file: &str, bytes: &[u8], dtype: DType, device: &Device) -> Result<Self> {
+        let mut weights = Self::from_tensors(file, HashMap::new());
+        weights.add_bytes(bytes, dtype, device)?;
+        Ok(weights)
+    }
+
+    /// Reads one safetensors file.
+    ///
+    /// # Errors
+    /// As [`Weights::from_bytes`], and [`Error::Io`].
+    pub fn from_file(path: &Path, dtype: DType, device: &Device) -> Result<Self> {
+        let bytes = std::fs::read(path).map_err(Error::io(path))?;
+        Self::from_bytes(&path.display().to_string(), &bytes, dtype, device)
+    }
+
+    fn add_bytes(&mut self, bytes: &[u8], dtype: DType, device: &Device) -> Result<()> {
+        let bad = |e: safetensors::SafeTensorError| {
+            Error::format(&self.file, e.to_string(), "a complete safetensors file")
+        };
+        let file = safetensors::SafeTensors::deserialize(bytes).map_err(bad)?;
+        for (name, view) in file.tensors() {
+            let stored = match view.dtype() {
+                safetensors::Dtype::F32 => DType::F32,
+                safetensors::Dtype::F16 => DType::F16,
+                safetensors::Dtype::BF16 => DType::BF16,
+                other => {
+                    return Err(Error::Tensor {
+                        file: self.file.clone(),
+                        name,
+                        found: format!("{other:?}"),
+                        expected: "F32, F16 or BF16".into(),
+                    });
+                }
+            };
+            let tensor = Tensor::from_raw_buffer(view.data(), stored, view.shape(), device)?;
+            self.tensors.insert(published_name(&name), tensor.to_dtype(dtype)?);
+        }
+        Ok(())
+    }
+
+    /// Whether a tensor of this name is there.
+    pub fn has(&self, name: &str) -> bool {
+        self.tensors.contains_key(name)
+    }
+
+    /// The tensor of this name, which must have this shape.
+    ///
+    /// A missing tensor is recorded and stands in as zeros, so that [`Weights::finish`] can list all of them at once.
+    ///
+    /// # Errors
+    /// [`Error::Tensor`] on another shape.
+    pub fn get(&self, name: &str, shape: &[usize]) -> Result<Tensor> {
+        let Some(tensor) = self.tensors.get(name) else {
+            self.missing.borrow_mut().insert(name.to_string(), shape.to_vec());
+            return Ok(Tensor::zeros(shape, DType::F32, &Device::Cpu)?);
+        };
+        if tensor.dims() != shape {
+            return Err(Error::Tensor {
+                file: self.file.clone(),
+                name: name.to_string(),
+                found: format!("shape {:?}", tensor.dims()),
+                expected: format!("shape {shape:?}"),
+            });
+        }
+        self.read.borrow_mut().insert(name.to_string());
+        Ok(tensor.clone())
+    }
+
+    /// Declares that a tensor may be there without being read (a redundant tied head).
+    pub fn ignore(&self, name: &str) {
+        self.read.borrow_mut().insert(name.to_string());
+    }
+
+    /// Names and shapes that were asked for and are not there: of an empty set, the whole checkpoint's layout.
+    pub fn wanted(&self) -> BTreeMap<String, Vec<usize>> {
+        self.missing.borrow().clone()
+    }
+
+    /// Must be called when the model is built: fails if a tensor was missing or one was never read.
+    ///
+    /// # Errors
+    /// [`Error::TensorSet`] lists both.
+    pub fn finish(&self) -> Result<()> {
+        let read = self.read.borrow();
+        let missing: Vec<String> = self.missing.borrow().keys().cloned().collect();
+        let mut unexpected: Vec<String> =
+            self.tensors.keys().filter(|k| !read.contains(*k)).cloned().collect();
+        unexpected.sort();
+        if missing.is_empty() && unexpected.is_empty() {
+            return Ok(());
+        }
+        Err(Error::TensorSet { file: self.file.clone(), missing, unexpected })
+    }
+}
