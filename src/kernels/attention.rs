@@ -1,7 +1,8 @@
 //! Attention over blocks of rows, without masks: a layout says what each row sees.
 
 use super::attention_composed::composed;
-use super::exec::{dims2, expect_dims};
+use super::attention_cpu::Attention;
+use super::exec::{dims2, expect_dims, on_cpu};
 use crate::error::{Error, Result};
 use candle_core::Tensor;
 use std::ops::Range;
@@ -33,11 +34,6 @@ impl Block {
     /// Items of the block.
     pub(super) fn items(&self) -> usize {
         self.queries.len() / self.q_period
-    }
-
-    /// Own key rows of all items.
-    pub(super) fn own(&self) -> Range<usize> {
-        self.own_start..self.own_start + self.items() * self.k_period
     }
 
     /// Own keys that row `i` of an item sees.
@@ -97,7 +93,16 @@ pub fn attention(
         let (k, v) = (Tensor::cat(&[sk, k], 0)?, Tensor::cat(&[sv, v], 0)?);
         return attention(q, &k, &v, None, &layout.moved(shared_rows));
     }
-    composed(q, k, v, shared, layout)
+    let pair: Vec<&Tensor> = shared.map(|(sk, sv)| vec![sk, sv]).unwrap_or_default();
+    if !on_cpu(&[q, k, v]) || !on_cpu(&pair) {
+        return composed(q, k, v, shared, layout);
+    }
+    let shared = match shared {
+        Some((sk, sv)) => Some((sk.contiguous()?, sv.contiguous()?)),
+        None => None,
+    };
+    let op = Attention::new(layout.clone(), shared);
+    Ok(q.contiguous()?.apply_op3(&k.contiguous()?, &v.contiguous()?, op)?)
 }
 
 impl AttentionLayout {

@@ -102,7 +102,7 @@ impl Images {
             for (y, out) in out.chunks_exact_mut(self.w * cout).enumerate() {
                 // A filter's three pixels of one row are neighbours in memory: no im2col.
                 let lhs = Lhs::rows(&padded[y * line..], cin, 3 * cin).segments(3, line);
-                multiply(level, out, cout, self.w, lhs, weight, init);
+                multiply(level, out, cout, self.w, lhs, weight.view(), init);
             }
         });
         out
@@ -120,7 +120,7 @@ impl Images {
                 let grad = Panels::from_rows(&grad[(first + y) * self.w * cout..], cout, self.w, cout);
                 for (dy, out) in out.chunks_exact_mut(3 * cin * cout).enumerate() {
                     let lhs = Lhs::columns(&padded[(y + dy) * line..], cin, self.w);
-                    multiply(level, out, cout, 3 * cin, lhs, &grad, Init::Add);
+                    multiply(level, out, cout, 3 * cin, lhs, grad.view(), Init::Add);
                 }
             }
             out

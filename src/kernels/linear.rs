@@ -56,7 +56,7 @@ fn product(x: &[f32], n: usize, k: usize, rhs: &Panels, m: usize, init: Init<'_>
         out.par_chunks_mut(ROWS * m).enumerate().for_each(|(i, out)| {
             let rows = out.len() / m;
             let x = &x[i * ROWS * k..(i * ROWS + rows) * k];
-            multiply(level, out, m, rows, Lhs::rows(x, k, k), rhs, init);
+            multiply(level, out, m, rows, Lhs::rows(x, k, k), rhs.view(), init);
         });
     }
     out
@@ -71,7 +71,7 @@ fn weight_grad(grad: &[f32], x: &[f32], n: usize, k: usize, m: usize) -> Vec<f32
         let rhs = Panels::from_rows(&x[from * k..], k, rows, k);
         let mut out = vec![0f32; m * k];
         let lhs = Lhs::columns(&grad[from * m..(from + rows) * m], m, rows);
-        multiply(level, &mut out, k, m, lhs, &rhs, Init::Zero);
+        multiply(level, &mut out, k, m, lhs, rhs.view(), Init::Zero);
         out
     });
     sum_in_order(partials, m * k)

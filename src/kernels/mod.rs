@@ -14,6 +14,11 @@ mod activation;
 mod adamw;
 mod attention;
 mod attention_composed;
+mod attention_cpu;
+mod attention_plan;
+mod attention_rows;
+#[cfg(test)]
+mod attention_tests;
 mod conv;
 mod exec;
 mod level;
@@ -25,6 +30,7 @@ mod rope;
 mod scale_shift;
 #[cfg(test)]
 mod testing;
+mod vector;
 
 pub use activation::{gelu_erf, swiglu};
 pub use adamw::adamw_step;

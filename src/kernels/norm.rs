@@ -1,8 +1,6 @@
 //! RMS normalisation.
 
-use super::exec::{
-    chunk_rows, dims2, expect_dims, map_chunks, on_cpu, output, read3, slice, sum_in_order, tensor,
-};
+use super::exec::{chunk_rows, dims2, expect_dims, on_cpu, output, read3, slice, sum_in_order, tensor};
 use super::level::{Level, per_level};
 use crate::error::Result;
 use candle_core::{CpuStorage, CustomOp2, D, Layout, Shape, Tensor};

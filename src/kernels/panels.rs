@@ -4,8 +4,8 @@
 //! along rows, along columns (a product with its transpose), or in several segments (the three
 //! image rows under a 3x3 filter), so it is never copied.
 
-use super::level::{Level, per_level};
-use super::math::madd;
+use super::level::per_level;
+use super::vector::{Baseline, Vector};
 
 /// A right-hand side `[k, n]` as panels of 16 or 32 columns, zero-padded: `[panel][k][nr]`.
 pub(in crate::kernels) struct Panels {
@@ -55,6 +55,36 @@ impl Panels {
             }
         }
         panels
+    }
+}
+
+/// Panels, or the first columns and rows of them.
+#[derive(Clone, Copy)]
+pub(in crate::kernels) struct View<'a> {
+    data: &'a [f32],
+    /// Elements from one panel to the next.
+    jump: usize,
+    k: usize,
+    n: usize,
+    nr: usize,
+}
+
+impl Panels {
+    pub(super) fn view(&self) -> View<'_> {
+        let Panels { data, k, n, nr } = self;
+        View { data, jump: k * nr, k: *k, n: *n, nr: *nr }
+    }
+}
+
+impl View<'_> {
+    /// Only the first `n` columns.
+    pub(super) fn columns(self, n: usize) -> Self {
+        View { n: n.min(self.n), ..self }
+    }
+
+    /// Only the first `k` rows.
+    pub(super) fn rows(self, k: usize) -> Self {
+        View { k: k.min(self.k), ..self }
     }
 }
 
@@ -108,7 +138,7 @@ pub(in crate::kernels) enum Init<'a> {
 
 per_level!(
     /// `dst = init + lhs * rhs`, where `dst` has `m` rows of `rhs.n` that start every `stride` elements.
-    fn multiply(dst: &mut [f32], stride: usize, m: usize, lhs: Lhs<'_>, rhs: &Panels, init: Init<'_>) = multiply_body
+    fn multiply(dst: &mut [f32], stride: usize, m: usize, lhs: Lhs<'_>, rhs: View<'_>, init: Init<'_>) = multiply_body
 );
 
 #[inline(always)]
@@ -117,7 +147,7 @@ fn multiply_body<const LANES: usize>(
     stride: usize,
     m: usize,
     lhs: Lhs<'_>,
-    rhs: &Panels,
+    rhs: View<'_>,
     init: Init<'_>,
 ) {
     if m == 0 || rhs.n == 0 {
@@ -126,59 +156,29 @@ fn multiply_body<const LANES: usize>(
     assert_eq!(lhs.segments * lhs.length, rhs.k, "inner dimensions");
     assert!(rhs.k == 0 || lhs.end(m) <= lhs.data.len(), "left-hand side too short");
     assert!((m - 1) * stride + rhs.n <= dst.len(), "destination too short");
-    assert!(rhs.data.len() == rhs.n.div_ceil(rhs.nr) * rhs.nr * rhs.k, "panels");
-    for p in 0..rhs.n.div_ceil(rhs.nr) {
-        let panel = &rhs.data[p * rhs.k * rhs.nr..(p + 1) * rhs.k * rhs.nr];
-        // Widths and heights of the register tile: as many sums as the registers of each
-        // instruction set hold beside the operands.
-        match (LANES, rhs.nr) {
-            (16, 32) => strip::<LANES, 12, 32>(dst, stride, m, lhs, panel, rhs, p * 32, init),
-            (16, _) => strip::<LANES, 12, 16>(dst, stride, m, lhs, panel, rhs, p * 16, init),
-            (8, nr) => {
-                for off in (0..nr).step_by(16) {
-                    strip::<LANES, 6, 16>(dst, stride, m, lhs, panel, rhs, p * nr + off, init);
-                }
-            }
-            (_, nr) => {
-                for off in (0..nr).step_by(8) {
-                    strip::<LANES, 6, 8>(dst, stride, m, lhs, panel, rhs, p * nr + off, init);
-                }
+    let panels = rhs.n.div_ceil(rhs.nr);
+    assert!((panels - 1) * rhs.jump + rhs.k * rhs.nr <= rhs.data.len(), "panels too short");
+    let width = strip_width(LANES).min(rhs.nr);
+    for p in 0..panels {
+        let panel = &rhs.data[p * rhs.jump..p * rhs.jump + rhs.k * rhs.nr];
+        for off in (0..rhs.nr).step_by(width) {
+            let col = p * rhs.nr + off;
+            if col < rhs.n {
+                let cols = width.min(rhs.n - col);
+                let strip = Strip { panel, nr: rhs.nr, off, col, cols };
+                strips::<LANES>(dst, stride, m, lhs, strip, init);
             }
         }
     }
 }
 
-/// `W` columns of the product, from column `col` on.
-#[inline(always)]
-#[allow(clippy::too_many_arguments)]
-fn strip<const LANES: usize, const MR: usize, const W: usize>(
-    dst: &mut [f32],
-    stride: usize,
-    m: usize,
-    lhs: Lhs<'_>,
-    panel: &[f32],
-    rhs: &Panels,
-    col: usize,
-    init: Init<'_>,
-) {
-    if col >= rhs.n {
-        return;
-    }
-    let b = Strip { panel, nr: rhs.nr, off: col % rhs.nr, col, cols: W.min(rhs.n - col) };
-    let mut r = 0;
-    while r + MR <= m {
-        block::<LANES, MR, W>(dst, stride, r, lhs, b, init);
-        r += MR;
-    }
-    while r + 4 <= m {
-        block::<LANES, 4, W>(dst, stride, r, lhs, b, init);
-        r += 4;
-    }
-    while r < m {
-        block::<LANES, 1, W>(dst, stride, r, lhs, b, init);
-        r += 1;
-    }
+/// Columns of a strip: two registers. (One of AVX-512 where panels have 16 columns.)
+const fn strip_width(lanes: usize) -> usize {
+    if cfg!(target_arch = "x86_64") { 2 * lanes } else { 2 * Baseline::LANES }
 }
+
+/// Elements of the widest strip.
+const WIDEST: usize = 32;
 
 #[derive(Clone, Copy)]
 struct Strip<'a> {
@@ -192,8 +192,67 @@ struct Strip<'a> {
     cols: usize,
 }
 
+/// One strip of columns. Heights and widths of the register tile: as many sums as the registers of
+/// each instruction set hold beside the operands.
 #[inline(always)]
-fn block<const LANES: usize, const MR: usize, const W: usize>(
+fn strips<const LANES: usize>(
+    dst: &mut [f32],
+    stride: usize,
+    m: usize,
+    lhs: Lhs<'_>,
+    b: Strip<'_>,
+    init: Init<'_>,
+) {
+    // SAFETY: `LANES` is 16 or 8 only inside functions compiled for, and called on, such machines;
+    // `multiply_body` checked the operands' sizes.
+    unsafe {
+        #[cfg(target_arch = "x86_64")]
+        match LANES {
+            16 if b.nr == 32 => {
+                return strip::<std::arch::x86_64::__m512, 12, 2>(dst, stride, m, lhs, b, init);
+            }
+            16 => return strip::<std::arch::x86_64::__m512, 12, 1>(dst, stride, m, lhs, b, init),
+            8 => return strip::<std::arch::x86_64::__m256, 6, 2>(dst, stride, m, lhs, b, init),
+            _ => {}
+        }
+        strip::<Baseline, 6, 2>(dst, stride, m, lhs, b, init)
+    }
+}
+
+/// # Safety
+/// The CPU must have `V`'s instructions; for `m` rows and every inner index `lhs` must be in bounds,
+/// `b.panel` must hold as many rows of `b.nr`, and `b.off` with the strip's width end within `b.nr`.
+#[inline(always)]
+unsafe fn strip<V: Vector, const MR: usize, const NV: usize>(
+    dst: &mut [f32],
+    stride: usize,
+    m: usize,
+    lhs: Lhs<'_>,
+    b: Strip<'_>,
+    init: Init<'_>,
+) {
+    let mut r = 0;
+    // SAFETY: the caller's promise; no tile passes row `m`.
+    unsafe {
+        while r + MR <= m {
+            block::<V, MR, NV>(dst, stride, r, lhs, b, init);
+            r += MR;
+        }
+        while r + 4 <= m {
+            block::<V, 4, NV>(dst, stride, r, lhs, b, init);
+            r += 4;
+        }
+        while r < m {
+            block::<V, 1, NV>(dst, stride, r, lhs, b, init);
+            r += 1;
+        }
+    }
+}
+
+/// # Safety
+/// As [`strip`], for `MR` rows from `row` on.
+#[inline(always)]
+unsafe fn block<V: Vector, const MR: usize, const NV: usize>(
     dst: &mut [f32],
     stride: usize,
     row: usize,
@@ -201,50 +260,51 @@ fn block<const LANES: usize, const MR: usize, const W: usize>(
     b: Strip<'_>,
     init: Init<'_>,
 ) {
-    let mut acc = [[0f32; W]; MR];
+    let mut start = [0f32; WIDEST];
     if let Init::Bias(bias) = init {
-        for acc in &mut acc {
-            acc[..b.cols].copy_from_slice(&bias[b.col..b.col + b.cols]);
-        }
+        start[..b.cols].copy_from_slice(&bias[b.col..b.col + b.cols]);
     }
-    // SAFETY: `multiply_body` checked that the left-hand side reaches its last row and inner index
-    // and that the panel holds `k` rows of `nr`; `off + W <= nr`.
-    let acc = unsafe {
-        if lhs.transposed {
-            tile::<LANES, MR, W, true>(acc, row, lhs, b)
-        } else {
-            tile::<LANES, MR, W, false>(acc, row, lhs, b)
-        }
-    };
-    for (r, acc) in acc.iter().enumerate() {
-        let from = (row + r) * stride + b.col;
-        let out = &mut dst[from..from + b.cols];
-        if let Init::Add = init {
-            for (o, a) in out.iter_mut().zip(acc) {
-                *o += a;
+    // SAFETY: the caller's promise; `start` and `line` hold `NV` registers (at most `WIDEST`
+    // elements), and so does a destination row where `cols` says that all of them exist.
+    unsafe {
+        let from: [V; NV] = std::array::from_fn(|c| V::load(start.as_ptr().add(c * V::LANES)));
+        let acc = match lhs.transposed {
+            true => tile::<V, MR, NV, true>([from; MR], row, lhs, b),
+            false => tile::<V, MR, NV, false>([from; MR], row, lhs, b),
+        };
+        for (r, acc) in acc.iter().enumerate() {
+            let to = (row + r) * stride + b.col;
+            let out = &mut dst[to..to + b.cols];
+            if b.cols == NV * V::LANES {
+                for (c, &acc) in acc.iter().enumerate() {
+                    let at = out.as_mut_ptr().add(c * V::LANES);
+                    let old = if let Init::Add = init { V::load(at) } else { V::splat(0.0) };
+                    acc.madd(V::splat(1.0), old).store(at);
+                }
+                continue;
             }
-        } else if b.cols == W {
-            out.copy_from_slice(acc);
-        } else {
-            for (o, a) in out.iter_mut().zip(acc) {
-                *o = *a;
+            let mut line = [0f32; WIDEST];
+            for (c, acc) in acc.iter().enumerate() {
+                acc.store(line.as_mut_ptr().add(c * V::LANES));
+            }
+            for (o, a) in out.iter_mut().zip(&line) {
+                *o = if let Init::Add = init { *o + a } else { *a };
             }
         }
     }
 }
 
-/// Sums of `MR` rows by `W` columns, kept in registers over the whole inner dimension.
+/// Sums of `MR` rows by `NV` registers, kept in registers over the whole inner dimension.
 ///
 /// # Safety
-/// For `MR` rows from `row` and every inner index, `lhs` must be in bounds; `b.panel` must hold
-/// as many rows of `b.nr`, and `b.off + W <= b.nr`.
+/// As [`strip`], for `MR` rows from `row` on.
 #[inline(always)]
-unsafe fn tile<const LANES: usize, const MR: usize, const W: usize, const TRANSPOSED: bool>(
-    mut acc: [[f32; W]; MR],
+unsafe fn tile<V: Vector, const MR: usize, const NV: usize, const TRANSPOSED: bool>(
+    mut acc: [[V; NV]; MR],
     row: usize,
     lhs: Lhs<'_>,
     b: Strip<'_>,
-) -> [[f32; W]; MR] {
+) -> [[V; NV]; MR] {
     // SAFETY: the caller's promise.
     unsafe {
         let mut right = b.panel.as_ptr().add(b.off);
@@ -252,12 +312,12 @@ unsafe fn tile<const LANES: usize, const MR: usize, const W: usize, const TRANSP
         for segment in 0..lhs.segments {
             let left = start.add(segment * lhs.jump);
             for i in 0..lhs.length {
-                let columns = &*right.cast::<[f32; W]>();
+                let columns: [V; NV] = std::array::from_fn(|c| V::load(right.add(c * V::LANES)));
                 for (r, acc) in acc.iter_mut().enumerate() {
                     let at = if TRANSPOSED { i * lhs.stride + r } else { r * lhs.stride + i };
-                    let x = *left.add(at);
-                    for c in 0..W {
-                        acc[c] = madd::<LANES>(x, columns[c], acc[c]);
+                    let x = V::splat(*left.add(at));
+                    for c in 0..NV {
+                        acc[c] = x.madd(columns[c], acc[c]);
                     }
                 }
                 right = right.wrapping_add(b.nr);
@@ -269,6 +329,7 @@ unsafe fn tile<const LANES: usize, const MR: usize, const W: usize, const TRANSP
 
 #[cfg(test)]
 mod tests {
+    use super::super::level::Level;
     use super::super::testing::{random, values};
     use super::*;
 
@@ -299,8 +360,8 @@ mod tests {
                 for (rhs, lhs) in [(0, 0), (0, 1), (1, 0), (1, 1)] {
                     // A stride above n: what lies between the rows must stay.
                     let mut dst = vec![5f32; m * (n + 1)];
-                    multiply(level, &mut dst, n + 1, m, lefts[lhs], &panels[rhs], Init::Bias(&bias));
-                    multiply(level, &mut dst, n + 1, m, lefts[lhs], &panels[rhs], Init::Add);
+                    multiply(level, &mut dst, n + 1, m, lefts[lhs], panels[rhs].view(), Init::Bias(&bias));
+                    multiply(level, &mut dst, n + 1, m, lefts[lhs], panels[rhs].view(), Init::Add);
                     for i in 0..m {
                         for j in 0..n {
                             let expected = 2.0 * exact[i * n + j] + j as f64;
@@ -321,7 +382,7 @@ mod tests {
         for level in Level::available() {
             let mut dst = vec![0f32; 9];
             let lhs = Lhs::rows(&a, 2, 3).segments(2, 20);
-            multiply(level, &mut dst, 3, 3, lhs, &Panels::from_rows(&b, 3, 6, 3), Init::Zero);
+            multiply(level, &mut dst, 3, 3, lhs, Panels::from_rows(&b, 3, 6, 3).view(), Init::Zero);
             for (i, found) in dst.iter().enumerate() {
                 let (r, c) = (i / 3, i % 3);
                 let expected: f32 = (0..6).map(|p| a[r * 2 + p % 3 + p / 3 * 20] * b[p * 3 + c]).sum();

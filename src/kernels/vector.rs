@@ -1,0 +1,93 @@
+//! The few vector operations of the matrix micro-kernel, for each register width.
+
+/// A register of f32. The compiler keeps arrays of these in registers, which it does not do for a
+/// large array of f32.
+///
+/// # Safety
+/// Each function may be called only where the CPU has the type's instruction set; pointers must be
+/// good for `LANES` elements, of any alignment.
+pub(super) trait Vector: Copy {
+    const LANES: usize;
+    unsafe fn splat(x: f32) -> Self;
+    unsafe fn load(from: *const f32) -> Self;
+    unsafe fn store(self, to: *mut f32);
+    /// `self * b + c`.
+    unsafe fn madd(self, b: Self, c: Self) -> Self;
+}
+
+#[cfg(target_arch = "x86_64")]
+mod x86 {
+    use super::Vector;
+    use std::arch::x86_64::*;
+
+    macro_rules! vector {
+        ($type:ty, $lanes:literal, $splat:ident, $load:ident, $store:ident, |$a:ident, $b:ident, $c:ident| $madd:expr) => {
+            impl Vector for $type {
+                const LANES: usize = $lanes;
+                #[inline(always)]
+                unsafe fn splat(x: f32) -> Self {
+                    // SAFETY: the caller has the instruction set.
+                    unsafe { $splat(x) }
+                }
+                #[inline(always)]
+                unsafe fn load(from: *const f32) -> Self {
+                    // SAFETY: the caller has the instruction set and a good pointer.
+                    unsafe { $load(from) }
+                }
+                #[inline(always)]
+                unsafe fn store(self, to: *mut f32) {
+                    // SAFETY: the caller has the instruction set and a good pointer.
+                    unsafe { $store(to, self) }
+                }
+                #[inline(always)]
+                unsafe fn madd(self, $b: Self, $c: Self) -> Self {
+                    let $a = self;
+                    // SAFETY: the caller has the instruction set.
+                    unsafe { $madd }
+                }
+            }
+        };
+    }
+    vector!(__m512, 16, _mm512_set1_ps, _mm512_loadu_ps, _mm512_storeu_ps, |a, b, c| {
+        _mm512_fmadd_ps(a, b, c)
+    });
+    vector!(__m256, 8, _mm256_set1_ps, _mm256_loadu_ps, _mm256_storeu_ps, |a, b, c| {
+        _mm256_fmadd_ps(a, b, c)
+    });
+    vector!(__m128, 4, _mm_set1_ps, _mm_loadu_ps, _mm_storeu_ps, |a, b, c| {
+        _mm_add_ps(_mm_mul_ps(a, b), c)
+    });
+}
+
+/// The register that every machine of this architecture has.
+#[cfg(target_arch = "x86_64")]
+pub(super) type Baseline = std::arch::x86_64::__m128;
+#[cfg(not(target_arch = "x86_64"))]
+pub(super) type Baseline = Four;
+
+/// Four f32 for the compiler to vectorise.
+#[derive(Clone, Copy)]
+#[cfg_attr(target_arch = "x86_64", allow(dead_code))]
+pub(super) struct Four([f32; 4]);
+
+impl Vector for Four {
+    const LANES: usize = 4;
+    #[inline(always)]
+    unsafe fn splat(x: f32) -> Self {
+        Four([x; 4])
+    }
+    #[inline(always)]
+    unsafe fn load(from: *const f32) -> Self {
+        // SAFETY: the caller's pointer is good for four elements.
+        Four(unsafe { from.cast::<[f32; 4]>().read_unaligned() })
+    }
+    #[inline(always)]
+    unsafe fn store(self, to: *mut f32) {
+        // SAFETY: the caller's pointer is good for four elements.
+        unsafe { to.cast::<[f32; 4]>().write_unaligned(self.0) }
+    }
+    #[inline(always)]
+    unsafe fn madd(self, b: Self, c: Self) -> Self {
+        Four(std::array::from_fn(|i| super::math::madd::<4>(self.0[i], b.0[i], c.0[i])))
+    }
+}
