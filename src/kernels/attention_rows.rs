@@ -1,7 +1,7 @@
 //! The row-wise parts of attention: softmax, its backward pass, and own keys that are few.
 
 use super::level::per_level;
-use super::math::{exp, madd};
+use super::math::{dot, exp, madd};
 
 per_level!(
     /// Each row of `scores` (rows every `stride`, `width` long) becomes `e^(s - max)` over its first
@@ -76,21 +76,6 @@ fn softmax_grad_body<const LANES: usize>(
         row_rest.fill(0.0);
         grad_rest.fill(0.0);
     }
-}
-
-#[inline(always)]
-fn dot<const LANES: usize>(a: &[f32], b: &[f32]) -> f32 {
-    let mut lanes = [0f32; 16];
-    let (mut ca, mut cb) = (a.chunks_exact(16), b.chunks_exact(16));
-    for (a, b) in (&mut ca).zip(&mut cb) {
-        for i in 0..16 {
-            lanes[i] = madd::<LANES>(a[i], b[i], lanes[i]);
-        }
-    }
-    for ((l, a), b) in lanes.iter_mut().zip(ca.remainder()).zip(cb.remainder()) {
-        *l = madd::<LANES>(*a, *b, *l);
-    }
-    lanes.iter().sum()
 }
 
 #[inline(always)]

@@ -1,8 +1,9 @@
 //! 3x3 convolution on channels-last images.
 
-use super::exec::{dims4, expect_dims, map_chunks, on_cpu, output, read, read2, slice, sum_in_order, tensor};
+use super::exec::{dims4, expect_dims, on_cpu, output, read, read2, slice, sum_in_order, tensor};
 use super::level::Level;
-use super::panels::{Init, Lhs, Panels, multiply};
+use super::panels::{Lhs, Panels};
+use super::product::{Init, multiply};
 use crate::error::Result;
 use candle_core::{CpuStorage, CustomOp2, CustomOp3, Layout, Shape, Tensor};
 use rayon::prelude::*;
@@ -79,25 +80,29 @@ impl Images {
     }
 
     /// The rows of a task with the row above and below and a column on either side, zero outside.
-    fn padded(self, x: &[f32], c: usize, first: usize, rows: usize) -> Vec<f32> {
-        let (line, y) = ((self.w + 2) * c, first % self.h);
-        let mut out = vec![0f32; (rows + 2) * line];
+    fn pad<'a>(self, out: &'a mut Vec<f32>, x: &[f32], c: usize, first: usize, rows: usize) -> &'a [f32] {
+        let (line, y, w) = ((self.w + 2) * c, first % self.h, self.w * c);
+        out.resize((rows + 2) * line, 0.0);
         for (r, out) in out.chunks_exact_mut(line).enumerate() {
-            if y + r >= 1 && y + r <= self.h {
-                let from = (first + r - 1) * self.w * c;
-                out[c..c + self.w * c].copy_from_slice(&x[from..from + self.w * c]);
+            if y + r < 1 || y + r > self.h {
+                out.fill(0.0);
+                continue;
             }
+            let from = (first + r - 1) * w;
+            out[..c].fill(0.0);
+            out[c..c + w].copy_from_slice(&x[from..from + w]);
+            out[c + w..].fill(0.0);
         }
         out
     }
 
     /// The convolution with weights as panels of `9 cin` rows in the order (dy, dx, channel).
-    fn convolve(self, x: &[f32], cin: usize, weight: &Panels, cout: usize, init: Init<'_>) -> Vec<f32> {
+    fn convolve(self, x: &[f32], cin: usize, weight: &Panels<'_>, cout: usize, init: Init<'_>) -> Vec<f32> {
         let level = Level::current();
         let mut out = vec![0f32; self.b * self.h * self.w * cout];
-        self.split(&mut out, cout).into_par_iter().enumerate().for_each(|(i, out)| {
+        self.split(&mut out, cout).into_par_iter().enumerate().for_each_init(Vec::new, |buffer, (i, out)| {
             let (first, rows) = self.task(i);
-            let padded = self.padded(x, cin, first, rows);
+            let padded = self.pad(buffer, x, cin, first, rows);
             let line = (self.w + 2) * cin;
             for (y, out) in out.chunks_exact_mut(self.w * cout).enumerate() {
                 // A filter's three pixels of one row are neighbours in memory: no im2col.
@@ -111,42 +116,44 @@ impl Images {
     /// The weight's gradient, `[dy][dx][cin][cout]`.
     fn weight_grad(self, x: &[f32], cin: usize, grad: &[f32], cout: usize) -> Vec<f32> {
         let level = Level::current();
-        let partials = map_chunks(self.tasks(), |i| {
+        let task = |buffer: &mut Vec<f32>, i: usize| {
             let (first, rows) = self.task(i);
-            let padded = self.padded(x, cin, first, rows);
+            let padded = self.pad(buffer, x, cin, first, rows);
             let line = (self.w + 2) * cin;
+            let grad = Panels::from_rows(&grad[first * self.w * cout..], cout, rows * self.w, cout);
             let mut out = vec![0f32; 9 * cin * cout];
             for y in 0..rows {
-                let grad = Panels::from_rows(&grad[(first + y) * self.w * cout..], cout, self.w, cout);
+                let rhs = grad.view().skip(y * self.w).rows(self.w);
                 for (dy, out) in out.chunks_exact_mut(3 * cin * cout).enumerate() {
                     let lhs = Lhs::columns(&padded[(y + dy) * line..], cin, self.w);
-                    multiply(level, out, cout, 3 * cin, lhs, grad.view(), Init::Add);
+                    multiply(level, out, cout, 3 * cin, lhs, rhs, Init::Add);
                 }
             }
             out
-        });
+        };
+        let partials = (0..self.tasks()).into_par_iter().map_init(Vec::new, task).collect();
         sum_in_order(partials, 9 * cin * cout)
     }
 }
 
 /// `[cout, cin, 3, 3]` as panels of rows (dy, dx, cin).
-fn forward_panels(weight: &[f32], cout: usize, cin: usize) -> Panels {
+fn forward_panels(weight: &[f32], cout: usize, cin: usize) -> Panels<'static> {
     let mut rows = vec![0f32; 9 * cin * cout];
     for (i, &w) in weight.iter().enumerate() {
         let (tap, ci, co) = (i % 9, i / 9 % cin, i / 9 / cin);
         rows[(tap * cin + ci) * cout + co] = w;
     }
-    Panels::from_rows(&rows, cout, 9 * cin, cout)
+    Panels::from_rows(&rows, cout, 9 * cin, cout).into_owned()
 }
 
 /// The same for the gradient of `x`: the filter turned by 180 degrees, inputs and outputs swapped.
-fn backward_panels(weight: &[f32], cout: usize, cin: usize) -> Panels {
+fn backward_panels(weight: &[f32], cout: usize, cin: usize) -> Panels<'static> {
     let mut rows = vec![0f32; 9 * cin * cout];
     for (i, &w) in weight.iter().enumerate() {
         let (tap, ci, co) = (8 - i % 9, i / 9 % cin, i / 9 / cin);
         rows[(tap * cout + co) * cin + ci] = w;
     }
-    Panels::from_rows(&rows, cin, 9 * cout, cin)
+    Panels::from_rows(&rows, cin, 9 * cout, cin).into_owned()
 }
 
 fn forward(

@@ -48,6 +48,31 @@ pub(super) fn erf<const LANES: usize>(x: f32) -> (f32, f32) {
     ((1.0 - p * t * gauss).copysign(x), gauss)
 }
 
+/// `a . b`, summed in four groups of 16 lanes: enough to keep a core's multipliers busy.
+#[inline(always)]
+pub(super) fn dot<const LANES: usize>(a: &[f32], b: &[f32]) -> f32 {
+    let mut sums = [[0f32; 16]; 4];
+    let (a64, a_rest) = a.as_chunks::<64>();
+    let (b64, b_rest) = b.as_chunks::<64>();
+    for (a, b) in a64.iter().zip(b64) {
+        for (g, sums) in sums.iter_mut().enumerate() {
+            for (l, sum) in sums.iter_mut().enumerate() {
+                *sum = madd::<LANES>(a[g * 16 + l], b[g * 16 + l], *sum);
+            }
+        }
+    }
+    let [mut lanes, second, third, fourth] = sums;
+    for l in 0..16 {
+        lanes[l] += second[l] + (third[l] + fourth[l]);
+    }
+    for (a, b) in a_rest.chunks(16).zip(b_rest.chunks(16)) {
+        for ((sum, &a), &b) in lanes.iter_mut().zip(a).zip(b) {
+            *sum = madd::<LANES>(a, b, *sum);
+        }
+    }
+    lanes.iter().sum()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -64,6 +89,16 @@ mod tests {
         }
         assert!(exp::<16>(f32::NEG_INFINITY) < 1.3e-38);
         assert_eq!(exp::<4>(0.0), 1.0);
+    }
+
+    #[test]
+    fn dot_sums_every_element_once() {
+        for n in [0usize, 1, 15, 16, 17, 63, 64, 150] {
+            let a: Vec<f32> = (0..n).map(|i| i as f32).collect();
+            let b = vec![2f32; n];
+            let expected = (n * n.saturating_sub(1)) as f32;
+            assert_eq!((dot::<16>(&a, &b), dot::<4>(&a, &b)), (expected, expected));
+        }
     }
 
     #[test]

@@ -19,13 +19,16 @@ mod attention_plan;
 mod attention_rows;
 #[cfg(test)]
 mod attention_tests;
+mod attention_tile;
 mod conv;
 mod exec;
 mod level;
 mod linear;
 mod math;
+mod memory;
 mod norm;
 mod panels;
+mod product;
 mod rope;
 mod scale_shift;
 #[cfg(test)]
@@ -37,6 +40,7 @@ pub use adamw::adamw_step;
 pub use attention::{AttentionLayout, Block, attention};
 pub use conv::conv3x3;
 pub use linear::linear;
+pub use memory::keep_freed_memory;
 pub use norm::rms_norm;
 pub use rope::rope;
 pub use scale_shift::{affine_act, batch_norm_act};

@@ -178,18 +178,10 @@ fn sums_body<const LANES: usize>(
 }
 per_level!(fn sums_chunk(x: &[f32], grad: &[f32], scale: &[f32], shift: &[f32], slope: f32, sum: &mut [f32], dot: &mut [f32]) = sums_body);
 
-/// `dx = dz * scale + x * by_x + constant`.
+/// `dx = dz * scale + x * by_x + constant`; `channels` are scale, shift, by_x and constant.
 #[inline(always)]
-fn dx_body<const LANES: usize>(
-    dx: &mut [f32],
-    x: &[f32],
-    grad: &[f32],
-    scale: &[f32],
-    shift: &[f32],
-    by_x: &[f32],
-    constant: &[f32],
-    slope: f32,
-) {
+fn dx_body<const LANES: usize>(dx: &mut [f32], x: &[f32], grad: &[f32], channels: [&[f32]; 4], slope: f32) {
+    let [scale, shift, by_x, constant] = channels;
     let width = scale.len();
     for ((dx, x), grad) in dx.chunks_mut(width).zip(x.chunks(width)).zip(grad.chunks(width)) {
         let channels = scale.iter().zip(shift).zip(by_x.iter().zip(constant));
@@ -199,7 +191,7 @@ fn dx_body<const LANES: usize>(
         }
     }
 }
-per_level!(fn dx_chunk(dx: &mut [f32], x: &[f32], grad: &[f32], scale: &[f32], shift: &[f32], by_x: &[f32], constant: &[f32], slope: f32) = dx_body);
+per_level!(fn dx_chunk(dx: &mut [f32], x: &[f32], grad: &[f32], channels: [&[f32]; 4], slope: f32) = dx_body);
 
 impl ScaleShift {
     /// Scale and shift that the tensors' values come to.
@@ -250,7 +242,7 @@ impl ScaleShift {
         let mut dx = vec![0f32; x.len()];
         dx.par_chunks_mut(chunk)
             .zip(x.par_chunks(chunk).zip(grad.par_chunks(chunk)))
-            .for_each(|(dx, (x, grad))| dx_chunk(level, dx, x, grad, &a, &b, &p, &q, self.slope));
+            .for_each(|(dx, (x, grad))| dx_chunk(level, dx, x, grad, [&a, &b, &p, &q], self.slope));
         [dx, d_first, sums.iter().map(|s| *s as f32).collect()]
     }
 }
