@@ -1,5 +1,7 @@
-//! Golden tensors of the reference implementation, and their comparison with ours.
+//! What several integration tests share: golden tensors of the reference implementation and their comparison with ours.
 #![allow(dead_code)]
+
+pub mod tiny;
 
 use candle_core::{DType, Device, Tensor};
 use std::cell::RefCell;
