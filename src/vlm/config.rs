@@ -127,11 +127,20 @@ impl<'a> Node<'a> {
     }
 
     pub(crate) fn size(&self, key: &str) -> Result<usize> {
+        // The bound keeps products of a few sizes far from overflow on hostile files.
+        self.size_up_to(key, 1 << 24)
+    }
+
+    /// A size with a bound of its own: one that is squared, or that counts parts to be built.
+    fn size_up_to(&self, key: &str, most: u64) -> Result<usize> {
         match self.value.get(key).and_then(Value::as_u64) {
-            // The bound keeps products of a few sizes far from overflow on hostile files.
-            Some(v) if (1..=1 << 24).contains(&v) => Ok(v as usize),
-            _ => self.wrong(key, "an integer of 1 to 2^24"),
+            Some(v) if (1..=most).contains(&v) => Ok(v as usize),
+            _ => self.wrong(key, &format!("an integer of 1 to {most}")),
         }
+    }
+
+    fn size_up_to_or(&self, key: &str, most: u64, default: usize) -> Result<usize> {
+        if self.absent(key) { Ok(default) } else { self.size_up_to(key, most) }
     }
 
     pub(crate) fn size_or(&self, key: &str, default: usize) -> Result<usize> {
@@ -298,7 +307,7 @@ fn text_config(n: &Node, tie_word_embeddings: bool) -> Result<TextConfig> {
     let theta_node = if rope.absent("rope_theta") { n } else { &rope };
     Ok(TextConfig {
         hidden_size: n.size("hidden_size")?,
-        layers: n.size("num_hidden_layers")?,
+        layers: n.size_up_to("num_hidden_layers", 1024)?,
         heads: n.size("num_attention_heads")?,
         kv_heads: n.size("num_key_value_heads")?,
         intermediate_size: n.size("intermediate_size")?,
@@ -316,14 +325,14 @@ fn vision_config(n: &Node) -> Result<VisionConfig> {
     // The reference reads `in_channels` and ignores the published `in_chans`; both are 3 everywhere.
     let channels = if n.absent("in_channels") { "in_chans" } else { "in_channels" };
     Ok(VisionConfig {
-        depth: n.size_or("depth", 32)?,
+        depth: n.size_up_to_or("depth", 1024, 32)?,
         hidden_size: n.size_or("hidden_size", 3584)?,
         intermediate_size: n.size_or("intermediate_size", 3420)?,
         heads: n.size_or("num_heads", 16)?,
         in_channels: n.size_or(channels, 3)?,
-        patch_size: n.size_or("patch_size", 14)?,
-        temporal_patch_size: n.size_or("temporal_patch_size", 2)?,
-        merge_size: n.size_or("spatial_merge_size", 2)?,
+        patch_size: n.size_up_to_or("patch_size", 1024, 14)?,
+        temporal_patch_size: n.size_up_to_or("temporal_patch_size", 64, 2)?,
+        merge_size: n.size_up_to_or("spatial_merge_size", 64, 2)?,
         window_size: n.size_or("window_size", 112)?,
         fullatt_block_indexes: if n.absent("fullatt_block_indexes") {
             vec![7, 15, 23, 31]

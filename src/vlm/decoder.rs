@@ -137,12 +137,16 @@ impl Decoder {
     /// # Errors
     /// [`Error::Argument`] on an id outside the vocabulary.
     pub fn embed(&self, ids: &[u32]) -> Result<Tensor> {
+        self.rows(&self.embed_tokens, ids)
+    }
+
+    fn rows(&self, table: &Tensor, ids: &[u32]) -> Result<Tensor> {
         if let Some(id) = ids.iter().find(|&&id| id as usize >= self.config.vocab_size) {
             let expected = format!("below the model's vocabulary of {}", self.config.vocab_size);
             return Err(Error::argument("token id", id, expected));
         }
-        let ids = Tensor::from_vec(ids.to_vec(), ids.len(), self.embed_tokens.device())?;
-        Ok(self.embed_tokens.index_select(&ids, 0)?)
+        let ids = Tensor::from_vec(ids.to_vec(), ids.len(), table.device())?;
+        Ok(table.index_select(&ids, 0)?)
     }
 
     /// The layout of heads with these blocks.
@@ -206,10 +210,9 @@ impl Decoder {
     /// Rows of the output head for these tokens only, `[ids, hidden]`.
     ///
     /// # Errors
-    /// [`Error::Tensors`] on an id outside the vocabulary.
+    /// [`Error::Argument`] on an id outside the vocabulary.
     pub fn head_rows(&self, ids: &[u32]) -> Result<Tensor> {
-        let ids = Tensor::from_vec(ids.to_vec(), ids.len(), self.head.device())?;
-        Ok(self.head.index_select(&ids, 0)?)
+        self.rows(&self.head, ids)
     }
 
     /// Logits over the entire vocabulary of normed hidden states, `[rows, vocab]`.

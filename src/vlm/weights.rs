@@ -6,6 +6,10 @@ use std::cell::RefCell;
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::path::Path;
 
+/// Values of all missing tensors together for which zeros stand in, at most. Beyond it a config is refused at once: it
+/// may ask for more than there is memory.
+const STAND_INS: usize = 1 << 28;
+
 /// The tensors of a checkpoint under their published names.
 ///
 /// Every read checks the shape and is recorded, so that [`Weights::finish`] can tell missing and unread tensors.
@@ -87,10 +91,10 @@ impl Weights {
     /// A missing tensor is recorded and stands in as zeros, so that [`Weights::finish`] can list all of them at once.
     ///
     /// # Errors
-    /// [`Error::Tensor`] on another shape.
+    /// [`Error::Tensor`] on another shape; [`Error::TensorSet`] at once if the missing tensors hold over 2^28 values.
     pub fn get(&self, name: &str, shape: &[usize]) -> Result<Tensor> {
         let Some(tensor) = self.tensors.get(name) else {
-            self.missing.borrow_mut().insert(name.to_string(), shape.to_vec());
+            self.miss(name, shape)?;
             return Ok(Tensor::zeros(shape, DType::F32, &Device::Cpu)?);
         };
         if tensor.dims() != shape {
@@ -103,6 +107,18 @@ impl Weights {
         }
         self.read.borrow_mut().insert(name.to_string());
         Ok(tensor.clone())
+    }
+
+    fn miss(&self, name: &str, shape: &[usize]) -> Result<()> {
+        let mut missing = self.missing.borrow_mut();
+        missing.insert(name.to_string(), shape.to_vec());
+        let values = |s: &[usize]| s.iter().try_fold(1usize, |n, &d| n.checked_mul(d));
+        let total = missing.values().try_fold(0usize, |n, s| n.checked_add(values(s)?));
+        if total.is_some_and(|n| n <= STAND_INS) {
+            return Ok(());
+        }
+        let missing = missing.keys().cloned().collect();
+        Err(Error::TensorSet { file: self.file.clone(), missing, unexpected: Vec::new() })
     }
 
     /// Declares that a tensor may be there without being read (a redundant tied head).
