@@ -55,6 +55,7 @@ fn compare(dir: &Path, config: &serde_json::Value, weights: &Weights) -> Result<
     let golden = Golden::open(dir);
     let file = dir.join("preprocessor_config.json");
     let preprocessor = PreprocessorConfig::from_json("preprocessor_config.json", &json(&file)).unwrap();
+    resized_sizes(&golden);
     let images: BTreeMap<char, Pixels> = "abc"
         .chars()
         .filter(|name| dir.join(format!("image_{name}.png")).exists())
@@ -75,6 +76,22 @@ fn check(dir: &Path, config: &str, weights: &Weights) {
         Ok(line) => println!("{config}, {line}"),
         Err(differences) => panic!("{}, {config}:\n{}", dir.display(), differences.join("\n")),
     }
+}
+
+/// Sizes before and after the resize, under several limits.
+fn resized_sizes(golden: &Golden) {
+    if !golden.has("smart_resize") {
+        return;
+    }
+    let wanted = golden.integers("smart_resize");
+    let ours = wanted.chunks(7).flat_map(|row| {
+        let [h, w, factor, low, high] = std::array::from_fn(|i| row[i] as usize);
+        let limits = serde_json::json!({"patch_size": factor / 2, "min_pixels": low, "max_pixels": high});
+        let config = PreprocessorConfig::from_json("limits", &limits).unwrap();
+        let (width, height) = config.smart_resize(w, h).unwrap();
+        [h, w, factor, low, high, height, width].map(|v| v as i64)
+    });
+    golden.exact("smart_resize", ours);
 }
 
 fn preprocess(golden: &Golden, preprocessor: &PreprocessorConfig, name: char) -> Pixels {

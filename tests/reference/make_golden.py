@@ -11,7 +11,7 @@ Keys are `{case}.{name}`; case a and b are prompts with one image, ab has both, 
 `vision_cos`, `vision_sin` and `vision_pos_hw` are in the order of the patches, `vision_block_i` and
 `merger_window_order` in window order, `merged` in the order of the image tokens. `text_layer_i` are outputs of decoder
 layers, `step_logits` the logits of each step of greedy generation, `generated_ids_rp105` is greedy with repetition
-penalty 1.05.
+penalty 1.05. Rows of `smart_resize` are height, width, factor, min_pixels, max_pixels, height, width.
 """
 
 import json
@@ -26,7 +26,7 @@ import transformers
 from PIL import Image
 from safetensors.torch import load_file, save_file
 from transformers.models.qwen2_5_vl import modeling_qwen2_5_vl as reference
-from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
+from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil, smart_resize
 
 OUT = pathlib.Path(sys.argv[1] if len(sys.argv) > 1 else pathlib.Path(__file__).parents[1] / "fixtures/qwen_small")
 STEPS = 12
@@ -139,6 +139,19 @@ def preprocess(golden):
             golden[f"{name}.pixel_values"] = rows
         out[name] = (rows, grid)
     return out
+
+
+def resized_sizes():
+    """Sizes before and after: random ones, ties, thin and tiny images, under several limits."""
+    rng = np.random.default_rng(3)
+    sides = np.concatenate([np.exp(rng.uniform(0, 8.3, (180, 2))).astype(int), rng.integers(1, 60, (60, 2)) * 14])
+    limits = [(28, 3136, 12845056), (28, 200704, 1003520), (12, 4000, 5200), (28, 3136, 50176)]
+    rows = []
+    for i, (h, w) in enumerate(sides.tolist()):
+        if max(h, w) <= 200 * min(h, w):
+            factor, low, high = limits[i % len(limits)]
+            rows.append([h, w, factor, low, high, *smart_resize(h, w, factor, low, high)])
+    return torch.tensor(rows)
 
 
 def random_model():
@@ -283,7 +296,7 @@ def main():
     assert transformers.__version__ == "5.23.0" and int(PIL.__version__.split(".")[0]) < 13
     torch.set_num_threads(1)
     OUT.mkdir(parents=True, exist_ok=True)
-    golden = {}
+    golden = {"smart_resize": resized_sizes()}
     images = preprocess(golden)
     model = random_model()
     save_model(model)
