@@ -52,6 +52,7 @@ struct Args {
 
 fn main() -> anyhow::Result<()> {
     let args = Args::parse();
+    sdim::kernels::keep_freed_memory();
     let mut config =
         TrainConfig { steps: args.steps, seed: args.seed, rate: args.rate, ..Default::default() };
     config.batch.frames = args.frames;

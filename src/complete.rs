@@ -123,6 +123,11 @@ pub struct Completion {
 /// Measurements asked for the alignment, at most; more are chosen spatially even.
 const ALIGN_POINTS: usize = 2048;
 
+/// Smallest side of a frame, pixels: one merged token of the published checkpoints.
+const MIN_SIDE: usize = 28;
+/// Largest aspect ratio of a frame, as in the published preprocessing.
+const MAX_RATIO: usize = 200;
+
 /// A loaded checkpoint, ready for frames. Cheap to clone and to share between threads.
 #[derive(Clone)]
 pub struct DepthCompleter {
@@ -156,6 +161,14 @@ impl DepthCompleter {
         Ok(Self::new(SdimModel::load(dir.as_ref(), device)?))
     }
 
+    /// Loads a checkpoint directory with an adapter on top.
+    ///
+    /// # Errors
+    /// As [`SdimModel::load_adapted`].
+    pub fn load_adapted(dir: impl AsRef<Path>, adapter: impl AsRef<Path>, device: &Device) -> Result<Self> {
+        Ok(Self::new(SdimModel::load_adapted(dir.as_ref(), Some(adapter.as_ref()), device)?))
+    }
+
     /// Wraps a model.
     pub fn new(model: SdimModel) -> Self {
         Self { model: Arc::new(model) }
@@ -169,7 +182,8 @@ impl DepthCompleter {
     /// Completes a frame: Z-depth in metres for each pixel, with a confidence.
     ///
     /// # Errors
-    /// [`Error::SizeMismatch`], [`Error::NoMeasurement`], [`Error::ImageSize`], [`Error::Cancelled`].
+    /// [`Error::SizeMismatch`]; [`Error::ImageSize`] on a side under 28 pixels or an aspect ratio over 200;
+    /// [`Error::NoMeasurement`]; [`Error::Cancelled`].
     pub fn complete(
         &self,
         rgb: &RgbImage,
@@ -194,18 +208,32 @@ impl DepthCompleter {
         if size != (sparse.width(), sparse.height()) {
             return Err(Error::SizeMismatch { rgb: size, depth: (sparse.width(), sparse.height()) });
         }
+        if size.0.min(size.1) < MIN_SIDE || size.0.max(size.1) > MAX_RATIO * size.0.min(size.1) {
+            let reason = format!(
+                "expected sides of at least {MIN_SIDE} pixels and an aspect ratio of at most {MAX_RATIO}"
+            );
+            return Err(Error::ImageSize { width: size.0, height: size.1, reason });
+        }
         sparse.require_points()?;
         let mut seconds = StageSeconds::default();
+        let _span = tracing::info_span!("complete", width = size.0, height = size.1).entered();
+        let span = tracing::info_span!("encode").entered();
         let (pixels, scattered) = self.model.preprocess(rgb, sparse)?;
         let tokens = self.model.encode(&pixels, &scattered)?;
+        drop(span);
         seconds.encode = start.elapsed().as_secs_f64();
+        let span = tracing::info_span!("prefill").entered();
         let mark = Instant::now();
         let prefix = self.model.read_prefix(&pixels, &tokens, sparse)?;
+        drop(span);
         seconds.prefill = mark.elapsed().as_secs_f64();
+        let span = tracing::info_span!("queries").entered();
         let mark = Instant::now();
         let frame = Frame::new(&self.model, &prefix, sparse, options)?;
         let (answers, residual) = frame.ask_all()?;
+        drop(span);
         seconds.queries = mark.elapsed().as_secs_f64();
+        let _refine = tracing::info_span!("refine").entered();
         let mark = Instant::now();
         let asked = answers.len() + residual.points.len();
         let map = frame.dense(rgb, answers, &residual)?;

@@ -6,6 +6,7 @@
 pub mod complete;
 pub mod depth;
 pub mod error;
+pub mod frame;
 pub mod fusion;
 pub mod kernels;
 pub mod model;
@@ -15,9 +16,11 @@ pub mod refine;
 pub mod scenes;
 #[cfg(feature = "train")]
 pub mod supervise;
+pub mod system;
 pub mod vlm;
 
-pub use complete::{CompleteOptions, Completion, DepthCompleter, Preserve};
+pub use complete::{CancelToken, CompleteOptions, Completion, DepthCompleter, Preserve};
 pub use depth::{DepthMap, DepthScale, SparseDepth};
 pub use error::{Error, Result};
+pub use frame::read_rgb;
 pub use query::QueryPlan;

@@ -3,16 +3,20 @@
 use crate::depth::SparseDepth;
 use crate::error::{Error, Result};
 use crate::fusion::{Fusion, Normalise};
+use crate::query::prompt::Glimpse;
 use crate::query::{Prefix, PromptWriter, Settings};
 use crate::vlm::QwenVl;
 use crate::vlm::config::{VlmConfig, read_json};
+use crate::vlm::linear::Linear;
 use crate::vlm::patch_embed::PatchEmbed;
 use crate::vlm::preprocess::{Pixels, PreprocessorConfig};
 use crate::vlm::tokenizer::Tokenizer;
 use crate::vlm::weights::Weights;
 use candle_core::{DType, Device, Tensor};
 use image::RgbImage;
+use rayon::prelude::*;
 use std::path::Path;
+use std::sync::Arc;
 
 /// The fusion block with the second patch embedding (F_e2 of Eq. 3a).
 pub struct DepthInjection {
@@ -28,6 +32,8 @@ pub struct SdimModel {
     pub vlm: QwenVl,
     /// What adds sparse depth to the image tokens; `None` for a checkpoint without it.
     pub injection: Option<DepthInjection>,
+    /// Crops around pixels to token embeddings, zero-initialised; `None` for a checkpoint without it.
+    pub glimpse: Option<Linear>,
     /// How frames are resized and normalised.
     pub preprocessor: PreprocessorConfig,
     /// How it is asked.
@@ -135,10 +141,25 @@ impl SdimModel {
             }),
             None => None,
         };
+        let glimpse = match settings.glimpse {
+            Some(side) => {
+                Some(Linear::new(weights, "sdim.glimpse", 3 * side * side, config.text.hidden_size, false)?)
+            }
+            None => None,
+        };
         let vlm = QwenVl::new(config, weights, settings.rope_layout)?;
         weights.finish()?;
         let number_rows = vlm.decoder.head_rows(&prompts.numbers().ids)?;
-        Ok(Self { vlm, injection, preprocessor, prompts, tokenizer, number_rows, device: device.clone() })
+        Ok(Self {
+            vlm,
+            injection,
+            glimpse,
+            preprocessor,
+            prompts,
+            tokenizer,
+            number_rows,
+            device: device.clone(),
+        })
     }
 
     /// Folds what inference need not keep apart.
@@ -158,8 +179,22 @@ impl SdimModel {
     /// # Errors
     /// Typed errors that name the file, key or tensor.
     pub fn load(dir: &Path, device: &Device) -> Result<Self> {
-        let files = CheckpointFiles::from_dir(dir)?;
-        let weights = Weights::from_file(&dir.join("model.safetensors"), DType::F32, device)?;
+        Self::load_adapted(dir, None, device)
+    }
+
+    /// Like [`SdimModel::load`], with an adapter directory whose `sdim.json` and `sdim.safetensors` replace or complete
+    /// those of the base checkpoint.
+    ///
+    /// # Errors
+    /// Typed errors that name the file, key or tensor.
+    pub fn load_adapted(dir: &Path, adapter: Option<&Path>, device: &Device) -> Result<Self> {
+        let mut files = CheckpointFiles::from_dir(dir)?;
+        let mut weights = Weights::from_file(&dir.join("model.safetensors"), DType::F32, device)?;
+        if let Some(adapter) = adapter {
+            let path = adapter.join("sdim.json");
+            files.settings = Settings::from_bytes(&path, &std::fs::read(&path).map_err(Error::io(&path))?)?;
+            weights.add_file(&adapter.join("sdim.safetensors"), DType::F32, device)?;
+        }
         Self::new(files, &weights, device)?.fold()
     }
 
@@ -208,10 +243,42 @@ impl SdimModel {
     ) -> Result<Prefix> {
         let resized = (pixels.resized.width() as usize, pixels.resized.height() as usize);
         let (tokens, space) = self.prompts.prefix(sparse, pixels.grid, resized, &self.vlm.config, 0)?;
+        let image = Arc::new(pixels.resized.clone());
         let embedded = self.vlm.embed_prompt(&tokens.ids, image_tokens)?;
+        let embedded = self.add_glimpses(embedded, &[(&image, &tokens.glimpses)])?;
         let mut cache = self.vlm.decoder.cache(1);
         self.vlm.prefill(&embedded, &tokens.positions, &mut cache)?;
-        Ok(Prefix { cache, space })
+        Ok(Prefix { cache, space, image })
+    }
+}
+
+impl SdimModel {
+    /// Adds the crop around its pixel to each token that stands at one; `groups` pairs images with the tokens that stand
+    /// in them, indices counting over all of `embedded`. Without a glimpse layer nothing changes.
+    ///
+    /// # Errors
+    /// [`Error::Tensors`] if an index is out of range.
+    pub fn add_glimpses(&self, embedded: Tensor, groups: &[(&RgbImage, &[Glimpse])]) -> Result<Tensor> {
+        let (Some(layer), Some(side)) = (&self.glimpse, self.prompts.settings().glimpse) else {
+            return Ok(embedded);
+        };
+        let count: usize = groups.iter().map(|(_, g)| g.len()).sum();
+        if count == 0 {
+            return Ok(embedded);
+        }
+        let len = 3 * side * side;
+        let mut crops = vec![0f32; count * len];
+        let all: Vec<(&RgbImage, Glimpse)> =
+            groups.iter().flat_map(|(image, list)| list.iter().map(move |g| (*image, *g))).collect();
+        crops.par_chunks_mut(len).zip(&all).for_each(|(crop, (image, g))| {
+            self.preprocessor.crop(image, g.x, g.y, side, crop);
+        });
+        let added = layer.forward(&Tensor::from_vec(crops, (count, len), &self.device)?)?;
+        if all.iter().enumerate().all(|(i, (_, g))| g.token == i) && count == embedded.dim(0)? {
+            return Ok((embedded + added)?);
+        }
+        let rows: Vec<u32> = all.iter().map(|(_, g)| g.token as u32).collect();
+        Ok(embedded.index_add(&Tensor::from_vec(rows, count, &self.device)?, &added, 0)?)
     }
 }
 

@@ -1,7 +1,7 @@
 //! Batches of per-pixel suffixes against one shared prefix.
 
 use super::number::{DigitReader, NumberFormat, Reading, read_bins};
-use super::prompt::{FrameSpace, Query, Tokens};
+use super::prompt::{FrameSpace, Glimpse, Query, Tokens};
 use crate::error::Result;
 use crate::kernels;
 use crate::model::SdimModel;
@@ -9,8 +9,10 @@ use crate::vlm::cache::KvCache;
 use crate::vlm::decoder::Context;
 use crate::vlm::rope::Position;
 use candle_core::Tensor;
+use image::RgbImage;
 use rayon::prelude::*;
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 /// What all queries of a frame share: its keys and values, read once, and its space.
 pub struct Prefix {
@@ -18,6 +20,8 @@ pub struct Prefix {
     pub cache: KvCache,
     /// Where pixels lie, and what numbers mean.
     pub space: FrameSpace,
+    /// The resized frame, for the crops around pixels.
+    pub image: Arc<RgbImage>,
 }
 
 /// Rows of one decoder pass, at most: large enough for efficient products, small enough for the caches.
@@ -75,8 +79,16 @@ fn ask_batch(
     let ids: Vec<u32> = batch.iter().flat_map(|&i| suffixes[i].ids.iter().copied()).collect();
     let positions: Vec<Position> =
         batch.iter().flat_map(|&i| suffixes[i].positions.iter().copied()).collect();
+    let length = suffixes[batch[0]].len();
+    let glimpses: Vec<Glimpse> = batch
+        .iter()
+        .enumerate()
+        .flat_map(|(n, &i)| {
+            suffixes[i].glimpses.iter().map(move |g| Glimpse { token: n * length + g.token, ..*g })
+        })
+        .collect();
     let mut own = model.vlm.decoder.cache(batch.len());
-    let mut logits = number_logits(model, prefix, &ids, &positions, &mut own)?;
+    let mut logits = number_logits(model, prefix, &ids, &positions, &glimpses, &mut own)?;
     match model.prompts.numbers().format {
         NumberFormat::Bins { range, bins } => {
             let rows: Vec<f32> = logits.flatten_all()?.to_vec1()?;
@@ -108,7 +120,7 @@ fn ask_batch(
                 }
                 let positions: Vec<Position> = next.iter().map(|&p| Position::text(p)).collect();
                 next.iter_mut().for_each(|p| *p += 1.0);
-                logits = number_logits(model, prefix, &ids, &positions, &mut own)?;
+                logits = number_logits(model, prefix, &ids, &positions, &[], &mut own)?;
             }
         }
     }
@@ -127,10 +139,11 @@ fn number_logits(
     prefix: &Prefix,
     ids: &[u32],
     positions: &[Position],
+    glimpses: &[Glimpse],
     own: &mut KvCache,
 ) -> Result<Tensor> {
     let decoder = &model.vlm.decoder;
-    let embedded = decoder.embed(ids)?;
+    let embedded = model.add_glimpses(decoder.embed(ids)?, &[(&prefix.image, glimpses)])?;
     let table = decoder.rope().table(positions, embedded.device())?;
     let items = own.items();
     let context = Context::Cached { shared: Some(&prefix.cache), own };

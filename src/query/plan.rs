@@ -35,10 +35,20 @@ impl FromStr for QueryPlan {
     }
 }
 
+impl std::fmt::Display for QueryPlan {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Every => write!(f, "every"),
+            Self::Stride(n) => write!(f, "stride:{n}"),
+            Self::Budget(n) => write!(f, "budget:{n}"),
+        }
+    }
+}
+
 /// The pixels of a lattice with this stride, row-major. It is centred, so that the border is at most half a stride away.
 pub fn lattice(width: usize, height: usize, stride: usize) -> Vec<(usize, usize)> {
     let stride = stride.max(1);
-    let first = |size: usize| ((size - 1) % stride) / 2;
+    let first = |size: usize| (size.saturating_sub(1) % stride) / 2;
     let mut out = Vec::new();
     for y in (first(height)..height).step_by(stride) {
         for x in (first(width)..width).step_by(stride) {

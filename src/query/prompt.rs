@@ -19,12 +19,38 @@ pub struct Tokens {
     pub ids: Vec<u32>,
     /// M-RoPE positions.
     pub positions: Vec<Position>,
+    /// Tokens that stand at a pixel.
+    pub glimpses: Vec<Glimpse>,
+}
+
+/// A token at a pixel, to which the crop around that pixel may be added.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Glimpse {
+    /// Index of the token.
+    pub token: usize,
+    /// Column in the resized image, fractional.
+    pub x: f32,
+    /// Row in the resized image, fractional.
+    pub y: f32,
 }
 
 impl Tokens {
     fn push(&mut self, id: u32, position: Position) {
         self.ids.push(id);
         self.positions.push(position);
+    }
+
+    /// Tokens that say a number at a pixel; the first one carries the crop.
+    fn push_at(&mut self, ids: &[u32], (x, y): (usize, usize), time: f32, space: &FrameSpace) {
+        let along =
+            |p: usize, size: usize, resized: usize| (p as f32 + 0.5) / size as f32 * resized as f32 - 0.5;
+        self.glimpses.push(Glimpse {
+            token: self.len(),
+            x: along(x, space.width, space.resized.0),
+            y: along(y, space.height, space.resized.1),
+        });
+        let position = space.pixel(x as f32, y as f32, time);
+        ids.iter().for_each(|&id| self.push(id, position));
     }
 
     /// Number of tokens.
@@ -183,7 +209,7 @@ impl PromptWriter {
         ids.extend(&self.after_image);
         let scale = self.settings.position_scale;
         let walked = positions(&ids, &[grid], config, scale)?;
-        let mut tokens = Tokens { ids, positions: walked.positions };
+        let mut tokens = Tokens { ids, positions: walked.positions, glimpses: Vec::new() };
         let space = FrameSpace {
             width: sparse.width(),
             height: sparse.height(),
@@ -196,10 +222,7 @@ impl PromptWriter {
         };
         if let MeasurementPrompt::Prefix { max } = self.settings.measurements {
             for (x, y, depth) in choose_evenly(sparse, max, seed) {
-                let position = space.pixel(x as f32, y as f32, MEASURED_TIME);
-                for id in self.numbers.write_ids(depth / space.unit) {
-                    tokens.push(id, position);
-                }
+                tokens.push_at(&self.numbers.write_ids(depth / space.unit), (x, y), MEASURED_TIME, &space);
             }
         }
         Ok((tokens, space))
@@ -225,15 +248,11 @@ impl PromptWriter {
                     text(&mut out, &tokenizer.encode(&self.fill_in(words, query, space))?);
                 }
                 Piece::Pointer => {
-                    let at = space.pixel(query.x as f32, query.y as f32, QUERY_TIME);
-                    match self.settings.hint {
-                        super::Hint::Linear => {
-                            for id in self.numbers.write_ids(query.hint / space.unit) {
-                                out.push(id, at);
-                            }
-                        }
-                        super::Hint::None => out.push(self.pointer.unwrap_or_default(), at),
-                    }
+                    let ids = match self.settings.hint {
+                        super::Hint::Linear => self.numbers.write_ids(query.hint / space.unit),
+                        super::Hint::None => self.pointer.into_iter().collect(),
+                    };
+                    out.push_at(&ids, (query.x, query.y), QUERY_TIME, space);
                 }
             }
         }

@@ -68,6 +68,10 @@ pub struct Settings {
     /// The guess that a pointer states.
     #[serde(default)]
     pub hint: Hint,
+    /// Side, in pixels of the resized image, of the crop around the pixel that is added to each token that stands at a
+    /// pixel; `null` for none.
+    #[serde(default)]
+    pub glimpse: Option<usize>,
     /// How numbers are written.
     pub number: NumberFormat,
     /// What the number 1 means.
@@ -92,6 +96,7 @@ impl Settings {
             pixel_reference: PixelReference::Coordinates,
             measurements: MeasurementPrompt::PerQuery,
             hint: Hint::None,
+            glimpse: None,
             number: NumberFormat::Digits { decimals: 3, integers: 3 },
             unit: DepthUnit::Metres,
             fusion: None,
@@ -108,6 +113,7 @@ impl Settings {
             pixel_reference: PixelReference::Pointer { token: "<|point|>".into() },
             measurements: MeasurementPrompt::Prefix { max: 384 },
             hint: Hint::Linear,
+            glimpse: Some(8),
             number: NumberFormat::Bins { bins: 1000, range: 1.25 },
             unit: DepthUnit::FrameMax,
             fusion: Some(FusionConfig { branch: 16, high: 32, low: 16 }),
@@ -137,6 +143,14 @@ impl Settings {
             && ![f.branch, f.high, f.low].iter().all(|c| (1..=1024).contains(c))
         {
             return Err(Error::config(file, "fusion", format!("{f:?}"), "1 to 1024 channels each"));
+        }
+        if self.glimpse.is_some_and(|side| !(1..=64).contains(&side)) {
+            return Err(Error::config(
+                file,
+                "glimpse",
+                format!("{:?}", self.glimpse),
+                "a side of 1 to 64 pixels",
+            ));
         }
         self.template.validate(file)?;
         self.number.validate(file)

@@ -8,6 +8,7 @@ use image::{ImageFormat, RgbImage};
 use super::RgbdFrame;
 use crate::depth::{DepthScale, SparseDepth, npy, png16};
 use crate::error::{Error, Result};
+use crate::frame::{image_error, read_rgb};
 
 const PICTURES: [&str; 3] = ["png", "jpg", "jpeg"];
 const DEPTHS: [&str; 2] = ["png", "npy"];
@@ -152,19 +153,6 @@ pub fn write_frame(dir: impl AsRef<Path>, name: &str, frame: &RgbdFrame, store: 
 fn in_units(metres: f32, scale: DepthScale) -> u16 {
     let units = (metres * scale.units()).round();
     if units > 0.0 && units <= f32::from(u16::MAX) { units as u16 } else { 0 }
-}
-
-fn image_error(path: &Path, error: image::ImageError) -> Error {
-    match error {
-        image::ImageError::IoError(e) => Error::io(path)(e),
-        other => Error::format(path, other.to_string(), "an RGB image in PNG or JPEG"),
-    }
-}
-
-fn read_rgb(path: &Path) -> Result<RgbImage> {
-    let reader = image::ImageReader::open(path).map_err(Error::io(path))?;
-    let reader = reader.with_guessed_format().map_err(Error::io(path))?;
-    Ok(reader.decode().map_err(|e| image_error(path, e))?.into_rgb8())
 }
 
 /// Files of a folder with one of the endings: (name without ending, path), sorted. Two files of one name are an error.

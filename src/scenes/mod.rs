@@ -10,6 +10,7 @@ mod furniture;
 mod light;
 mod patterns;
 mod rooms;
+pub mod score;
 mod shapes;
 mod space;
 mod stage;

@@ -182,7 +182,10 @@ pub fn initial(
         let residual = 0.5 / (2.0 * layers as f32).sqrt();
         let std = if name.ends_with("bias") || name.ends_with("running_mean") {
             0.0
-        } else if name.starts_with("sdim.fusion.depth.conv") || name.starts_with("sdim.fusion.out") {
+        } else if name.starts_with("sdim.fusion.depth.conv")
+            || name.starts_with("sdim.fusion.out")
+            || name.starts_with("sdim.glimpse")
+        {
             0.0
         } else if name.starts_with("sdim.fusion") && shape.len() == 4 {
             (2.0 / fan_in).sqrt()

@@ -124,7 +124,7 @@ impl Parameters {
                 decay,
                 step,
                 scale,
-            );
+            )?;
             for (a, v) in parameter.average.iter_mut().zip(&parameter.values) {
                 *a += (1.0 - keep) * (v - *a);
             }

@@ -11,6 +11,7 @@ use crate::kernels::{self, Block};
 use crate::model::SdimModel;
 use crate::query::Settings;
 use crate::query::number::{NumberFormat, POINT};
+use crate::query::prompt::Glimpse;
 use crate::vlm::decoder::Context;
 use crate::vlm::grid::Grid;
 use crate::vlm::rope::Position;
@@ -76,6 +77,8 @@ pub struct Trainer {
     parameters: Parameters,
     model: SdimModel,
     step: usize,
+    /// The batch of a coming step.
+    prefetched: Option<(u64, Vec<Example>)>,
 }
 
 /// Momentum of the running statistics.
@@ -106,7 +109,7 @@ impl Trainer {
         let parameters = Parameters::new(start)?;
         let weights = Weights::from_tensors("training", parameters.tensors());
         let model = SdimModel::new(files.parse()?, &weights, &Device::Cpu)?;
-        Ok(Self { config, files, parameters, model, step: 0 })
+        Ok(Self { config, files, parameters, model, step: 0, prefetched: None })
     }
 
     /// Continues from a state written by [`Trainer::save`].
@@ -162,17 +165,34 @@ impl Trainer {
     /// # Errors
     /// [`Error::Argument`] if the gradients are not finite; errors of the scenes and the model.
     pub fn train_step(&mut self) -> Result<StepReport> {
-        let examples = batch::make(&self.model, &self.config.batch, self.config.seed, self.step as u64)?;
+        let step = self.step as u64;
+        let examples = match self.prefetched.take() {
+            Some((for_step, examples)) if for_step == step => examples,
+            _ => self.make_batch(step)?,
+        };
         let mut stats = Vec::new();
         let frozen = self.step as f32 >= self.config.freeze_norm_at * self.config.steps as f32;
-        let parts = self.loss(&examples, if frozen { None } else { Some(&mut stats) })?;
+        // The next batch is rendered in the gaps of this one: much of a backward pass runs on one thread.
+        let (passes, next) = rayon::join(
+            || -> Result<_> {
+                let parts = self.loss(&examples, if frozen { None } else { Some(&mut stats) })?;
+                let grads = parts.total.backward()?;
+                Ok((parts, grads))
+            },
+            || self.make_batch(step + 1),
+        );
+        let (parts, grads) = passes?;
+        self.prefetched = Some((step + 1, next?));
         let loss = parts.total.to_scalar::<f32>()?;
-        let grads = parts.total.backward()?;
         let rate = self.rate(self.step);
         let gradient = self.parameters.step(&grads, &self.config.optimiser, rate, self.step + 1)?;
         self.update_statistics(&stats)?;
         self.step += 1;
         Ok(StepReport { step: self.step, loss, l1: parts.l1, gradient, rate })
+    }
+
+    fn make_batch(&self, step: u64) -> Result<Vec<Example>> {
+        batch::make(&self.model, &self.config.batch, self.config.seed, step)
     }
 
     fn update_statistics(&mut self, stats: &[BatchStats]) -> Result<()> {
@@ -201,6 +221,9 @@ impl Trainer {
         let decoder = &self.model.vlm.decoder;
         let packed = Packed::new(examples);
         let embedded = self.model.vlm.embed_prompt(&packed.ids, &image_tokens)?;
+        let pairs = examples.iter().zip(&packed.glimpses);
+        let groups: Vec<_> = pairs.map(|(e, g)| (&e.pixels.resized, g.as_slice())).collect();
+        let embedded = self.model.add_glimpses(embedded, &groups)?;
         let table = decoder.rope().table(&packed.positions, &Device::Cpu)?;
         let layout = decoder.layout(packed.blocks);
         let hidden = decoder.forward(&embedded, &table, Context::Packed(&layout), None)?;
@@ -258,12 +281,16 @@ struct Packed {
     positions: Vec<Position>,
     blocks: Vec<Block>,
     supervised: Vec<u32>,
+    /// Per example.
+    glimpses: Vec<Vec<Glimpse>>,
 }
 
 impl Packed {
     fn new(examples: &[Example]) -> Self {
-        let mut out = Self { ids: vec![], positions: vec![], blocks: vec![], supervised: vec![] };
+        let mut out =
+            Self { ids: vec![], positions: vec![], blocks: vec![], supervised: vec![], glimpses: vec![] };
         for e in examples {
+            out.glimpses.push(Vec::new());
             let start = out.ids.len();
             out.extend(&e.prefix);
             let end = out.ids.len();
@@ -298,6 +325,10 @@ impl Packed {
     }
 
     fn extend(&mut self, tokens: &crate::query::prompt::Tokens) {
+        let start = self.ids.len();
+        if let Some(list) = self.glimpses.last_mut() {
+            list.extend(tokens.glimpses.iter().map(|g| Glimpse { token: start + g.token, ..*g }));
+        }
         self.ids.extend(&tokens.ids);
         self.positions.extend(&tokens.positions);
     }

@@ -2,6 +2,8 @@
 
 use crate::error::{Error, Result};
 use candle_core::{DType, Device, Tensor};
+use half::{bf16, f16};
+use rayon::prelude::*;
 use std::cell::RefCell;
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::path::Path;
@@ -18,6 +20,16 @@ pub struct Weights {
     tensors: HashMap<String, Tensor>,
     read: RefCell<BTreeSet<String>>,
     missing: RefCell<BTreeMap<String, Vec<usize>>>,
+}
+
+/// Little-endian floats of a file as f32, in one pass.
+fn widened(bytes: &[u8], stored: DType) -> Vec<f32> {
+    let pairs = || bytes.par_chunks_exact(2).map(|b| [b[0], b[1]]);
+    match stored {
+        DType::BF16 => pairs().map(|b| bf16::from_le_bytes(b).to_f32()).collect(),
+        DType::F16 => pairs().map(|b| f16::from_le_bytes(b).to_f32()).collect(),
+        _ => bytes.par_chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect(),
+    }
 }
 
 /// Maps an in-memory name of `transformers` >= 4.52 to the published one.
@@ -52,8 +64,22 @@ impl Weights {
     /// # Errors
     /// As [`Weights::from_bytes`], and [`Error::Io`].
     pub fn from_file(path: &Path, dtype: DType, device: &Device) -> Result<Self> {
-        let bytes = std::fs::read(path).map_err(Error::io(path))?;
-        Self::from_bytes(&path.display().to_string(), &bytes, dtype, device)
+        let mut weights = Self::from_tensors("", HashMap::new());
+        weights.add_file(path, dtype, device)?;
+        Ok(weights)
+    }
+
+    /// Adds the tensors of another file, which replace those of the same name.
+    ///
+    /// # Errors
+    /// As [`Weights::from_file`].
+    pub fn add_file(&mut self, path: &Path, dtype: DType, device: &Device) -> Result<()> {
+        let file = std::fs::File::open(path).map_err(Error::io(path))?;
+        // SAFETY: the map is read-only and lives for this call. That nobody truncates the file meanwhile is the caller's
+        // part, as with any program that maps its weights; a file that is short to begin with is refused below.
+        let bytes = unsafe { memmap2::Mmap::map(&file) }.map_err(Error::io(path))?;
+        self.file = path.display().to_string();
+        self.add_bytes(&bytes, dtype, device)
     }
 
     fn add_bytes(&mut self, bytes: &[u8], dtype: DType, device: &Device) -> Result<()> {
@@ -75,8 +101,12 @@ impl Weights {
                     });
                 }
             };
-            let tensor = Tensor::from_raw_buffer(view.data(), stored, view.shape(), device)?;
-            self.tensors.insert(published_name(&name), tensor.to_dtype(dtype)?);
+            let tensor = if dtype == DType::F32 {
+                Tensor::from_vec(widened(view.data(), stored), view.shape(), device)?
+            } else {
+                Tensor::from_raw_buffer(view.data(), stored, view.shape(), device)?.to_dtype(dtype)?
+            };
+            self.tensors.insert(published_name(&name), tensor);
         }
         Ok(())
     }

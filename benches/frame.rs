@@ -1,0 +1,47 @@
+//! Stages of one 640x480 frame on the embedded checkpoint: `cargo bench --bench frame`.
+
+use criterion::{Criterion, criterion_group, criterion_main};
+use sdim::query::{Query, ask};
+use sdim::refine::{Answered, EdgeAwareFill, Fill, FillInput};
+use sdim::scenes::{procedural, sample_points};
+use sdim::{CompleteOptions, DepthCompleter, QueryPlan};
+
+fn frame(c: &mut Criterion) {
+    let frame = procedural(2_000_003, 640, 480).expect("a scene");
+    let sparse = sample_points(&frame.depth, 640, 480, 500, 1).expect("points");
+    let completer = DepthCompleter::tiny().expect("the embedded checkpoint");
+    let model = completer.model();
+    let (pixels, scattered) = model.preprocess(&frame.rgb, &sparse).expect("a frame");
+    let tokens = model.encode(&pixels, &scattered).expect("tokens");
+    let prefix = model.read_prefix(&pixels, &tokens, &sparse).expect("a prefix");
+    let queries: Vec<Query> =
+        (0..4096).map(|i| Query { x: i * 7 % 640, y: i * 11 % 480, measured: None, hint: 2.0 }).collect();
+
+    let mut group = c.benchmark_group("tiny-640x480");
+    group.sample_size(10);
+    group.bench_function("preprocess", |b| b.iter(|| model.preprocess(&frame.rgb, &sparse)));
+    group.bench_function("encode", |b| b.iter(|| model.encode(&pixels, &scattered)));
+    group.bench_function("prefill", |b| b.iter(|| model.read_prefix(&pixels, &tokens, &sparse)));
+    group.bench_function("ask-4096", |b| b.iter(|| ask(model, &prefix, &queries, &mut |_| true)));
+    let asked: Vec<Answered> = (0..160 * 120)
+        .map(|i| Answered {
+            x: i % 160 * 4,
+            y: i / 160 * 4,
+            depth: 2.0 + (i % 7) as f32 * 0.01,
+            confidence: 0.9,
+            expected_error: 0.01,
+        })
+        .collect();
+    let input = FillInput { width: 640, height: 480, rgb: &frame.rgb, asked: &asked, sparse: &sparse };
+    group.bench_function("fill-stride-4", |b| b.iter(|| EdgeAwareFill::default().fill(&input)));
+    for plan in [QueryPlan::Stride(4), QueryPlan::Stride(2)] {
+        let options = CompleteOptions { plan, ..Default::default() };
+        group.bench_function(format!("complete-{plan}"), |b| {
+            b.iter(|| completer.complete(&frame.rgb, &sparse, &options));
+        });
+    }
+    group.finish();
+}
+
+criterion_group!(benches, frame);
+criterion_main!(benches);

@@ -1,0 +1,29 @@
+//! RGB frames from files.
+
+use crate::error::{Error, Result};
+use image::{DynamicImage, ImageDecoder, ImageError, ImageReader, RgbImage};
+use std::path::Path;
+
+/// Reads a PNG or JPEG as 8-bit RGB, upright: an EXIF orientation is applied, alpha is dropped, grey is spread.
+///
+/// # Errors
+/// [`Error::Io`], or [`Error::Format`] if the file is not a complete image.
+pub fn read_rgb(path: impl AsRef<Path>) -> Result<RgbImage> {
+    let path = path.as_ref();
+    let reader = ImageReader::open(path).map_err(Error::io(path))?;
+    let reader = reader.with_guessed_format().map_err(Error::io(path))?;
+    let wrong = |e: ImageError| image_error(path, e);
+    let mut decoder = reader.into_decoder().map_err(wrong)?;
+    let orientation = decoder.orientation().map_err(wrong)?;
+    let mut image = DynamicImage::from_decoder(decoder).map_err(wrong)?;
+    image.apply_orientation(orientation);
+    Ok(image.into_rgb8())
+}
+
+/// The crate's form of an image error, naming the file.
+pub(crate) fn image_error(path: &Path, error: ImageError) -> Error {
+    match error {
+        ImageError::IoError(e) if e.kind() != std::io::ErrorKind::UnexpectedEof => Error::io(path)(e),
+        other => Error::format(path, other.to_string(), "a complete RGB image in PNG or JPEG"),
+    }
+}

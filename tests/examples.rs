@@ -1,0 +1,116 @@
+//! The example programs, run as a user runs them.
+
+use serde_json::Value;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+/// The example's program, built if `cargo test` was asked for this test alone.
+fn program(name: &str) -> PathBuf {
+    let test = std::env::current_exe().unwrap();
+    let profile = test.parent().unwrap().parent().unwrap();
+    let path = profile.join("examples").join(format!("{name}{}", std::env::consts::EXE_SUFFIX));
+    if !path.exists() {
+        let mut cargo = Command::new(env!("CARGO"));
+        cargo.args(["build", "--example", name]).current_dir(env!("CARGO_MANIFEST_DIR"));
+        if profile.ends_with("release") {
+            cargo.arg("--release");
+        }
+        assert!(cargo.status().unwrap().success());
+    }
+    path
+}
+
+fn run(name: &str, args: &[&str]) -> Output {
+    Command::new(program(name)).args(args).output().unwrap()
+}
+
+fn text(path: &Path) -> &str {
+    path.to_str().unwrap()
+}
+
+#[test]
+fn complete_runs_on_the_bundled_pair() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = run("complete", &["--out", text(dir.path()), "--json"]);
+    assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
+    let v: Value = serde_json::from_slice(&out.stdout).unwrap();
+    assert_eq!(v["valid"].as_u64().unwrap(), v["width"].as_u64().unwrap() * v["height"].as_u64().unwrap());
+    assert!(v["mae"].as_f64().unwrap() < v["nearest"]["mae"].as_f64().unwrap());
+    for key in ["load", "encode", "prefill", "queries", "refine", "total"] {
+        assert!(v["seconds"][key].as_f64().unwrap() >= 0.0, "{key}");
+    }
+    for key in ["measured", "asked", "queries_per_second", "rmse", "abs_rel"] {
+        assert!(v[key].as_f64().unwrap() > 0.0, "{key}");
+    }
+    for name in ["dense.png", "dense.npy", "confidence.npy", "preview.png"] {
+        assert!(dir.path().join(name).metadata().unwrap().len() > 1000, "{name}");
+    }
+    let again = sdim::SparseDepth::read(dir.path().join("dense.npy"), None).unwrap();
+    let bundled = Path::new(env!("CARGO_MANIFEST_DIR")).join("assets/example/sparse.png");
+    let sparse = sdim::SparseDepth::read(bundled, Some(sdim::DepthScale::millimetres())).unwrap();
+    assert!(sparse.points().all(|(x, y, d)| again.get(x, y) == Some(d)), "measured pixels in the file");
+}
+
+#[test]
+fn complete_writes_nothing_on_bad_input() {
+    let dir = tempfile::tempdir().unwrap();
+    let out_dir = dir.path().join("out");
+    let bundled = Path::new(env!("CARGO_MANIFEST_DIR")).join("assets/example");
+    let (rgb, sparse) = (bundled.join("rgb.png"), bundled.join("sparse.png"));
+    let cut = dir.path().join("cut.png");
+    std::fs::write(&cut, &std::fs::read(&rgb).unwrap()[..5000]).unwrap();
+    let absent = dir.path().join("absent");
+    let cases: [(&[&str], &str); 5] = [
+        (&["--rgb", text(&cut), "--sparse", text(&sparse), "--depth-scale", "mm"], "cut.png"),
+        (&["--rgb", text(&rgb), "--sparse", text(&sparse)], "scale"),
+        (&["--rgb", text(&rgb), "--sparse", text(&rgb), "--depth-scale", "mm"], "rgb.png"),
+        (&["--model", text(&absent)], "absent"),
+        (&["--plan", "stride:0"], "stride:0"),
+    ];
+    for (args, named) in cases {
+        let out = run("complete", &[args, &["--out", text(&out_dir)]].concat());
+        let said = String::from_utf8_lossy(&out.stderr).into_owned();
+        assert!(!out.status.success() && said.contains(named), "{args:?}: {said}");
+        assert!(!said.contains("panicked"), "{said}");
+        assert!(out.stdout.is_empty() && !out_dir.exists(), "{args:?}");
+    }
+}
+
+#[test]
+fn evaluate_scores_a_rendered_folder() {
+    let dir = tempfile::tempdir().unwrap();
+    let out =
+        run("render", &["--out", text(dir.path()), "--count", "3", "--width", "160", "--height", "120"]);
+    assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
+    let json = dir.path().join("scores.json");
+    let args = ["--data", text(dir.path()), "--points", "100", "--limit", "2", "--json", text(&json)];
+    let out = run("evaluate", &args);
+    assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
+    let v: Value = serde_json::from_slice(&std::fs::read(&json).unwrap()).unwrap();
+    assert_eq!(v["frames"], 2);
+    for method in ["sdim", "nearest", "linear"] {
+        for key in ["mae", "rmse", "abs_rel"] {
+            assert!(v["methods"][method][key].as_f64().unwrap() > 0.0, "{method}.{key}");
+        }
+    }
+}
+
+#[test]
+fn train_resumes_and_its_checkpoint_loads() {
+    let dir = tempfile::tempdir().unwrap();
+    let model = dir.path().join("model");
+    let base =
+        ["--out", text(&model), "--steps", "4", "--frames", "1", "--questions", "8", "--log-every", "1"];
+    let first = run("train", &[&base[..], &["--stop-at", "2"]].concat());
+    assert!(first.status.success(), "{}", String::from_utf8_lossy(&first.stderr));
+    let second = run("train", &[&base[..], &["--resume"]].concat());
+    assert!(second.status.success(), "{}", String::from_utf8_lossy(&second.stderr));
+    let curve = std::fs::read_to_string(model.join("curve.csv")).unwrap();
+    let steps: Vec<&str> = curve.lines().skip(1).map(|l| l.split(',').next().unwrap()).collect();
+    assert_eq!(steps, ["1", "2", "3", "4"]);
+    let out = run(
+        "complete",
+        &["--model", text(&model), "--out", text(&dir.path().join("out")), "--plan", "stride:32"],
+    );
+    assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
+}
