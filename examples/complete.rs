@@ -27,10 +27,10 @@ struct Args {
     #[arg(long, requires = "rgb")]
     sparse: Option<PathBuf>,
     /// Unit of integer depth files: mm, kitti (1/256 m), tum (1/5000 m) or units per metre.
-    #[arg(long)]
+    #[arg(long, requires = "rgb")]
     depth_scale: Option<DepthScale>,
     /// Dense ground truth, for errors and two more panels in the preview.
-    #[arg(long)]
+    #[arg(long, requires = "rgb")]
     gt: Option<PathBuf>,
     /// `tiny` (inside the crate) or a checkpoint directory.
     #[arg(long, default_value = "tiny")]
@@ -99,6 +99,18 @@ fn main() -> anyhow::Result<()> {
     let rgb = read_rgb(&inputs.rgb)?;
     let sparse = SparseDepth::read(&inputs.sparse, inputs.scale)?;
     let gt = inputs.gt.as_ref().map(|p| SparseDepth::read(p, inputs.scale)).transpose()?;
+    for (path, map) in [(Some(&inputs.sparse), Some(&sparse)), (inputs.gt.as_ref(), gt.as_ref())] {
+        if let (Some(path), Some(map)) = (path, map) {
+            let sizes = [(map.width(), map.height()), (rgb.width() as usize, rgb.height() as usize)];
+            let [depth, picture] = sizes.map(|(w, h)| format!("{w}x{h}"));
+            anyhow::ensure!(
+                depth == picture,
+                "{}: {depth} pixels; expected {picture} as {}",
+                path.display(),
+                inputs.rgb.display()
+            );
+        }
+    }
     let load_seconds = start.elapsed().as_secs_f64();
 
     let bar = bar()?;
@@ -114,11 +126,12 @@ fn main() -> anyhow::Result<()> {
     let done = completer.complete_detailed(&rgb, &sparse, &options)?;
     bar.finish_and_clear();
     let scores = match &gt {
-        Some(gt) => {
+        // Where everything was given as input there is nothing to score.
+        Some(gt) if gt.points().any(|(x, y, _)| sparse.get(x, y).is_none()) => {
             let score = |depth: &[f32]| errors(depth, gt.as_slice(), &sparse);
             Some((score(done.map.depth())?, score(&interpolate::nearest(&sparse)?)?))
         }
-        None => None,
+        _ => None,
     };
 
     std::fs::create_dir_all(&args.out).with_context(|| args.out.display().to_string())?;

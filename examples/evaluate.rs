@@ -8,6 +8,7 @@
 
 mod common;
 
+use anyhow::Context;
 use clap::Parser;
 use common::{load, rounded};
 use indicatif::ProgressBar;
@@ -28,8 +29,8 @@ struct Args {
     #[arg(long, conflicts_with = "data")]
     procedural: Option<usize>,
     /// Unit of integer depth files: mm, kitti, tum or units per metre.
-    #[arg(long, default_value = "mm")]
-    depth_scale: DepthScale,
+    #[arg(long)]
+    depth_scale: Option<DepthScale>,
     /// Points drawn from the ground truth where a frame has no sparse file.
     #[arg(long, default_value_t = 500)]
     points: usize,
@@ -94,6 +95,9 @@ fn main() -> anyhow::Result<()> {
         (None, n) => Frames::Procedural(n.unwrap_or(100)),
     };
     let completer = load(&args.model, args.adapter.as_deref(), &args.device)?;
+    if let Some(folder) = args.json.as_ref().and_then(|p| p.parent()).filter(|p| !p.as_os_str().is_empty()) {
+        anyhow::ensure!(folder.is_dir(), "--json: there is no folder {}", folder.display());
+    }
     let options = CompleteOptions { plan: args.plan, ..Default::default() };
     let count = frames.len().min(args.limit.unwrap_or(usize::MAX));
     let bar = ProgressBar::new(count as u64);
@@ -127,7 +131,8 @@ fn report(args: &Args, all: &[Vec<Errors>; 3], count: usize, seconds: f64) -> an
     }
     if let Some(path) = &args.json {
         let object = json!({"frames": count, "methods": Value::Object(methods), "seconds": seconds});
-        std::fs::write(path, serde_json::to_string_pretty(&object)?)?;
+        std::fs::write(path, serde_json::to_string_pretty(&object)?)
+            .with_context(|| path.display().to_string())?;
     }
     Ok(())
 }

@@ -3,14 +3,15 @@
 //! `cargo run --release --example train -- --out DIR [--steps N] [--resume]`
 //!
 //! Writes DIR/{config,preprocessor_config,sdim,tokenizer}.json, model.safetensors (what `--model DIR` loads),
-//! trainer.safetensors (what `--resume` continues from), train.json (the configuration) and curve.csv.
+//! trainer.safetensors (what `--resume` continues from), train.json (the configuration), curve.csv, and DIR/best: the
+//! checkpoint that did best on held-out scenes so far.
 
 use anyhow::Context;
 use clap::Parser;
 use sdim::query::Settings;
 use sdim::supervise::{LabelSource, TrainConfig, Trainer, evaluate};
 use std::io::Write;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 #[derive(Parser)]
@@ -43,11 +44,36 @@ struct Args {
     #[arg(long)]
     stop_at: Option<usize>,
     /// Steps between log lines.
-    #[arg(long, default_value_t = 50)]
+    #[arg(long, default_value_t = 50, value_parser = at_least_one)]
     log_every: usize,
     /// Steps between checkpoints with an evaluation on held-out scenes.
-    #[arg(long, default_value_t = 500)]
+    #[arg(long, default_value_t = 500, value_parser = at_least_one)]
     save_every: usize,
+}
+
+fn at_least_one(text: &str) -> Result<usize, String> {
+    text.parse().ok().filter(|&n| n > 0).ok_or_else(|| "expected a number of at least 1".to_string())
+}
+
+const HEADER: &str = "step,seconds,loss,l1,gradient,rate,sdim_100,linear_100,sdim_500,linear_500";
+
+/// The rows of curve.csv up to the step that training resumes from, and the seconds spent until there.
+fn curve_until(path: &Path, step: usize) -> anyhow::Result<(Vec<String>, f32)> {
+    if step == 0 || !path.exists() {
+        return Ok((vec![HEADER.to_string()], 0.0));
+    }
+    let text = std::fs::read_to_string(path).with_context(|| path.display().to_string())?;
+    let first = |row: &str, i: usize| row.split(',').nth(i).and_then(|v| v.parse::<f32>().ok());
+    let rows: Vec<String> =
+        text.lines().filter(|row| first(row, 0).is_none_or(|s| s <= step as f32)).map(String::from).collect();
+    let seconds = rows.iter().rev().find_map(|row| first(row, 1)).unwrap_or(0.0);
+    Ok((rows, seconds))
+}
+
+/// Mean of the model's error over interpolation's in a row with an evaluation.
+fn score(row: &str) -> Option<f32> {
+    let v: Vec<f32> = row.split(',').filter_map(|v| v.parse().ok()).collect();
+    (v.len() == 10).then(|| 0.5 * (v[6] / v[7] + v[8] / v[9]))
 }
 
 fn main() -> anyhow::Result<()> {
@@ -62,18 +88,19 @@ fn main() -> anyhow::Result<()> {
         "sparse" => LabelSource::Sparse,
         other => anyhow::bail!("--labels {other}: expected dense or sparse"),
     };
-    std::fs::create_dir_all(&args.out)?;
+    std::fs::create_dir_all(&args.out).with_context(|| args.out.display().to_string())?;
     let mut trainer = Trainer::new(config.clone(), &Settings::tiny())?;
     if args.resume {
         trainer.resume(&args.out)?;
     }
     std::fs::write(args.out.join("train.json"), serde_json::to_string_pretty(&config)?)?;
     let path = args.out.join("curve.csv");
-    let mut curve = std::fs::OpenOptions::new().create(true).append(true).open(&path).context("curve.csv")?;
-    if curve.metadata()?.len() == 0 {
-        writeln!(curve, "step,seconds,loss,l1,gradient,rate,sdim_100,linear_100,sdim_500,linear_500")?;
-    }
+    let (rows, before) = curve_until(&path, trainer.step())?;
+    let mut best = rows.iter().filter_map(|r| score(r)).fold(f32::INFINITY, f32::min);
+    let mut curve = std::fs::File::create(&path).with_context(|| path.display().to_string())?;
+    writeln!(curve, "{}", rows.join("\n"))?;
     eprintln!("{} parameters, step {} of {}", trainer.parameter_count(), trainer.step(), config.steps);
+
     let stop = args.stop_at.unwrap_or(config.steps).min(config.steps);
     let (start, mut loss, mut l1, mut seen) = (Instant::now(), 0.0, 0.0, 0);
     while trainer.step() < stop {
@@ -82,29 +109,33 @@ fn main() -> anyhow::Result<()> {
         l1 += report.l1;
         seen += 1;
         let save = report.step % args.save_every == 0 || report.step == stop;
-        if report.step % args.log_every == 0 || save {
-            let n = seen as f32;
-            let mut line = format!(
-                "{},{:.1},{:.4},{:.5},{:.3},{:.2e}",
-                report.step,
-                start.elapsed().as_secs_f32(),
-                loss / n,
-                l1 / n,
-                report.gradient,
-                report.rate
-            );
-            (loss, l1, seen) = (0.0, 0.0, 0);
-            if save {
-                trainer.save(&args.out)?;
-                let model = trainer.averaged_model()?;
-                for points in [100, 500] {
-                    let e = evaluate(&model, 24, points, 1_000_000)?;
-                    line += &format!(",{:.5},{:.5}", e.model, e.linear);
-                }
-            }
-            writeln!(curve, "{line}")?;
-            eprintln!("{line}");
+        if report.step % args.log_every != 0 && !save {
+            continue;
         }
+        let (n, seconds) = (seen as f32, before + start.elapsed().as_secs_f32());
+        let mut row = format!(
+            "{},{seconds:.1},{:.4},{:.5},{:.3},{:.2e}",
+            report.step,
+            loss / n,
+            l1 / n,
+            report.gradient,
+            report.rate
+        );
+        (loss, l1, seen) = (0.0, 0.0, 0);
+        if save {
+            trainer.save(&args.out)?;
+            let model = trainer.averaged_model()?;
+            for points in [100, 500] {
+                let e = evaluate(&model, 24, points, 1_000_000)?;
+                row += &format!(",{:.5},{:.5}", e.model, e.linear);
+            }
+            if let Some(s) = score(&row).filter(|s| *s < best) {
+                best = s;
+                trainer.publish(&args.out.join("best"))?;
+            }
+        }
+        writeln!(curve, "{row}")?;
+        eprintln!("{row}");
     }
     Ok(())
 }

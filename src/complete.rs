@@ -21,7 +21,8 @@ pub enum Preserve {
     /// They keep their measurement bit for bit, with confidence 1.
     #[default]
     Keep,
-    /// They are asked like any other pixel; where the template has mask sentences, with mask 1 as in the paper.
+    /// They are asked like any other pixel where the plan comes to them, with mask 1 as in the paper where the template has
+    /// mask sentences; where it does not, they are filled from answers.
     Ask,
 }
 
@@ -64,7 +65,7 @@ pub struct CompleteOptions {
     /// measurements.
     pub align: bool,
     /// How pixels that were not asked are filled.
-    pub fill: Arc<dyn Fill + Send + Sync>,
+    pub fill: Arc<dyn Fill>,
     /// Told after each batch.
     pub progress: Option<ProgressCallback>,
     /// Checked after each batch.
@@ -271,9 +272,10 @@ impl<'a> Frame<'a> {
         Ok(Self { model, prefix, sparse, options, hint })
     }
 
-    fn query(&self, (x, y): (usize, usize)) -> Query {
+    /// What is asked at a pixel; `tell` states its measurement where the template has a place for it.
+    fn query(&self, (x, y): (usize, usize), tell: bool) -> Query {
         let hint = self.hint[y * self.sparse.width() + x];
-        Query { x, y, measured: self.sparse.get(x, y), hint }
+        Query { x, y, measured: self.sparse.get(x, y).filter(|_| tell), hint }
     }
 
     /// Pixels of a plan that need an answer: measured ones do not, where they are kept.
@@ -282,8 +284,14 @@ impl<'a> Frame<'a> {
         pixels.into_iter().filter(|&(x, y)| !keep || self.sparse.get(x, y).is_none()).collect()
     }
 
-    fn ask(&self, pixels: &[(usize, usize)], before: usize, planned: usize) -> Result<Vec<Reading>> {
-        let queries: Vec<Query> = pixels.iter().map(|&p| self.query(p)).collect();
+    fn ask(
+        &self,
+        pixels: &[(usize, usize)],
+        tell: bool,
+        before: usize,
+        planned: usize,
+    ) -> Result<Vec<Reading>> {
+        let queries: Vec<Query> = pixels.iter().map(|&p| self.query(p, tell)).collect();
         ask(self.model, self.prefix, &queries, &mut |answered| {
             if let Some(callback) = &self.options.progress {
                 callback(Progress { answered: before + answered, planned });
@@ -299,6 +307,7 @@ impl<'a> Frame<'a> {
             QueryPlan::Every => (lattice(width, height, 1), 1, 0),
             QueryPlan::Stride(n) => (lattice(width, height, n), n, 0),
             QueryPlan::Budget(n) => {
+                let n = n.min(width * height);
                 let stride = stride_within(width, height, n.div_ceil(2));
                 let first = lattice(width, height, stride);
                 let rest = n.saturating_sub(first.len());
@@ -312,14 +321,16 @@ impl<'a> Frame<'a> {
         };
         let planned = coarse.len() + budget + anchors.len();
         let mut pixels = coarse;
-        let mut readings = self.ask(&pixels, 0, planned)?;
+        let mut readings = self.ask(&pixels, true, 0, planned)?;
         if budget > 0 {
             let more = self.refinement(&first, stride, &pixels, &readings, budget);
-            readings.extend(self.ask(&more, pixels.len(), planned)?);
+            let planned = pixels.len() + more.len() + anchors.len();
+            readings.extend(self.ask(&more, true, pixels.len(), planned)?);
             pixels.extend(more);
         }
         let anchor_pixels: Vec<(usize, usize)> = anchors.iter().map(|a| (a.0, a.1)).collect();
-        let said = self.ask(&anchor_pixels, pixels.len(), pixels.len() + anchors.len())?;
+        // An answer that was told its measurement would only repeat it.
+        let said = self.ask(&anchor_pixels, false, pixels.len(), pixels.len() + anchors.len())?;
         let mut residual = Residual::default();
         for ((x, y, measured), reading) in anchors.into_iter().zip(said) {
             if reading.value.is_finite() {
@@ -380,7 +391,9 @@ impl<'a> Frame<'a> {
                 })
             })
             .collect();
-        let input = FillInput { width, height, rgb, asked: &asked, sparse: self.sparse };
+        let none = SparseDepth::from_points(width, height, &[])?;
+        let kept = if self.options.preserve == Preserve::Keep { self.sparse } else { &none };
+        let input = FillInput { width, height, rgb, asked: &asked, sparse: kept };
         let mut filled = self.options.fill.fill(&input)?;
         let mut measured = vec![false; width * height];
         if self.options.preserve == Preserve::Keep {

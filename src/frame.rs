@@ -7,13 +7,16 @@ use std::path::Path;
 /// Reads a PNG or JPEG as 8-bit RGB, upright: an EXIF orientation is applied, alpha is dropped, grey is spread.
 ///
 /// # Errors
-/// [`Error::Io`], or [`Error::Format`] if the file is not a complete image.
+/// [`Error::Io`]; [`Error::Format`] if the file is not a complete image; [`Error::ImageSize`] over 2^28 pixels.
 pub fn read_rgb(path: impl AsRef<Path>) -> Result<RgbImage> {
     let path = path.as_ref();
     let reader = ImageReader::open(path).map_err(Error::io(path))?;
     let reader = reader.with_guessed_format().map_err(Error::io(path))?;
     let wrong = |e: ImageError| image_error(path, e);
     let mut decoder = reader.into_decoder().map_err(wrong)?;
+    // A header of a few bytes may claim any size; memory is set aside only for what a camera could have taken.
+    let (width, height) = decoder.dimensions();
+    crate::depth::pixel_count(width as usize, height as usize)?;
     let orientation = decoder.orientation().map_err(wrong)?;
     let mut image = DynamicImage::from_decoder(decoder).map_err(wrong)?;
     image.apply_orientation(orientation);

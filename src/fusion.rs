@@ -84,8 +84,10 @@ impl ConvBnAct {
 
     /// Scale and shift per channel that stand for the running statistics.
     fn affine(&self) -> Result<(Tensor, Tensor)> {
-        let scale = (&self.gamma / (&self.var + BN_EPS)?.sqrt()?)?;
-        let shift = (&self.beta - (&self.mean * &scale)?)?;
+        // Running statistics are measured, never trained.
+        let (mean, var) = (self.mean.detach(), self.var.detach());
+        let scale = (&self.gamma / (var + BN_EPS)?.sqrt()?)?;
+        let shift = (&self.beta - (mean * &scale)?)?;
         Ok((scale, shift))
     }
 

@@ -1,4 +1,8 @@
-//! Dense metric depth from an RGB frame and sparse depth, by asking a vision-language model how far each pixel is.
+#![cfg_attr(feature = "tiny", doc = include_str!("../README.md"))]
+#![cfg_attr(
+    not(feature = "tiny"),
+    doc = "Dense metric depth from an RGB frame and sparse depth, by asking a VLM."
+)]
 #![deny(missing_docs)]
 #![deny(unsafe_op_in_unsafe_fn)]
 #![warn(clippy::all)]
@@ -6,6 +10,7 @@
 pub mod complete;
 pub mod depth;
 pub mod error;
+mod files;
 pub mod frame;
 pub mod fusion;
 pub mod kernels;

@@ -117,7 +117,7 @@ impl CheckpointFiles {
 }
 
 impl SdimModel {
-    /// Builds the model; `strict` fails on missing or unread tensors.
+    /// Builds the model; fails on missing or unread tensors.
     ///
     /// # Errors
     /// [`Error::Config`] if the preprocessor's patches are not the model's; tensor and tokenizer errors.

@@ -70,11 +70,11 @@ fn beats_linear_interpolation_on_held_out_scenes() {
         let frame = procedural(seed, 320, 240).unwrap();
         let sparse = sample_points(&frame.depth, 320, 240, 100, seed).unwrap();
         let map = TINY.complete(&frame.rgb, &sparse, &options(QueryPlan::Stride(4))).unwrap();
-        let mae = |d: &[f32]| sdim::depth::metrics::errors(d, &frame.depth, &sparse).unwrap().abs_rel;
+        let mae = |d: &[f32]| sdim::depth::metrics::errors(d, &frame.depth, &sparse).unwrap().mae;
         model += mae(map.depth());
         linear += mae(&sdim::depth::interpolate::linear(&sparse).unwrap());
     }
-    assert!(model < 0.9 * linear, "model {model}, linear {linear}");
+    assert!(model < 0.8 * linear, "model {model}, linear {linear}");
 }
 
 #[test]
@@ -139,6 +139,11 @@ fn files_that_are_not_what_they_should_be_are_named() {
         assert!(error.to_string().contains(name));
     }
     assert!(matches!(read_rgb(path("absent.png")), Err(Error::Io { .. })));
+    // A header that claims 4 billion by 4 billion pixels, and nothing behind it.
+    let mut header = bytes[..33].to_vec();
+    header[16..24].fill(0x7f);
+    std::fs::write(path("huge.png"), header).unwrap();
+    assert!(read_rgb(path("huge.png")).is_err());
     for bad in ["", "inch", "0", "-1", "nan"] {
         assert!(bad.parse::<DepthScale>().is_err(), "{bad}");
     }

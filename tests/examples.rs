@@ -60,7 +60,21 @@ fn complete_writes_nothing_on_bad_input() {
     let cut = dir.path().join("cut.png");
     std::fs::write(&cut, &std::fs::read(&rgb).unwrap()[..5000]).unwrap();
     let absent = dir.path().join("absent");
-    let cases: [(&[&str], &str); 5] = [
+    let (none, other) = (dir.path().join("none.png"), dir.path().join("other.png"));
+    let scale = sdim::DepthScale::millimetres();
+    sdim::depth::png16::write_png16(&none, 640, 480, &[0; 640 * 480]).unwrap();
+    sdim::depth::png16::write_png16(&other, 480, 640, &[scale.stored(1.0).0; 640 * 480]).unwrap();
+    let short = dir.path().join("short.png");
+    std::fs::write(&short, &std::fs::read(&sparse).unwrap()[..3000]).unwrap();
+    let cases: [(&[&str], &str); 10] = [
+        (&["--rgb", text(&rgb), "--sparse", text(&none), "--depth-scale", "mm"], "no valid measurement"),
+        (&["--rgb", text(&rgb), "--sparse", text(&other), "--depth-scale", "mm"], "other.png"),
+        (
+            &["--rgb", text(&rgb), "--sparse", text(&sparse), "--depth-scale", "mm", "--gt", text(&other)],
+            "other.png",
+        ),
+        (&["--rgb", text(&rgb), "--sparse", text(&short), "--depth-scale", "mm"], "short.png"),
+        (&["--rgb", text(&rgb), "--sparse", text(&sparse), "--depth-scale", "inch"], "inch"),
         (&["--rgb", text(&cut), "--sparse", text(&sparse), "--depth-scale", "mm"], "cut.png"),
         (&["--rgb", text(&rgb), "--sparse", text(&sparse)], "scale"),
         (&["--rgb", text(&rgb), "--sparse", text(&rgb), "--depth-scale", "mm"], "rgb.png"),
@@ -83,7 +97,18 @@ fn evaluate_scores_a_rendered_folder() {
         run("render", &["--out", text(dir.path()), "--count", "3", "--width", "160", "--height", "120"]);
     assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
     let json = dir.path().join("scores.json");
-    let args = ["--data", text(dir.path()), "--points", "100", "--limit", "2", "--json", text(&json)];
+    let args = [
+        "--data",
+        text(dir.path()),
+        "--depth-scale",
+        "mm",
+        "--points",
+        "100",
+        "--limit",
+        "2",
+        "--json",
+        text(&json),
+    ];
     let out = run("evaluate", &args);
     assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
     let v: Value = serde_json::from_slice(&std::fs::read(&json).unwrap()).unwrap();

@@ -36,7 +36,13 @@ impl Setup {
         } else {
             sdim::supervise::init::FreshFiles::tiny(settings).unwrap()
         };
-        let model = tiny::model(&files, tiny::tensors(&files, 11));
+        let mut tensors = tiny::tensors(&files, 11);
+        if let Some(glimpse) = tensors.get_mut("sdim.glimpse.weight") {
+            // A fresh one is zero and would hide whose crop goes where.
+            let wave: Vec<f32> = (0..glimpse.elem_count()).map(|i| (i as f32 * 0.37).sin() * 0.02).collect();
+            *glimpse = Tensor::from_vec(wave, glimpse.dims(), &Device::Cpu).unwrap();
+        }
+        let model = tiny::model(&files, tensors);
         let (rgb, sparse): (RgbImage, SparseDepth) = tiny::frame(90, 70);
         let (pixels, scattered) = model.preprocess(&rgb, &sparse).unwrap();
         let image_tokens = model.encode(&pixels, &scattered).unwrap();
@@ -44,6 +50,7 @@ impl Setup {
         let resized = (pixels.resized.width() as usize, pixels.resized.height() as usize);
         let (tokens, _) = model.prompts.prefix(&sparse, pixels.grid, resized, &model.vlm.config, 0).unwrap();
         let embedded = model.vlm.embed_prompt(&tokens.ids, &image_tokens).unwrap();
+        let embedded = model.add_glimpses(embedded, &[(&pixels.resized, &tokens.glimpses)]).unwrap();
         assert_eq!(prefix.cache.len(), tokens.len());
         Self { model, prefix, embedded, positions: tokens.positions, sparse, text_tokens }
     }
@@ -64,10 +71,22 @@ impl Setup {
         self.model.prompts.suffix(query, &self.prefix.space, &self.model.tokenizer).unwrap()
     }
 
+    /// Embeddings of suffixes, one after the other, each with its own crops.
+    fn embed(&self, suffixes: &[Tokens]) -> Tensor {
+        let embedded: Vec<Tensor> = suffixes
+            .iter()
+            .map(|s| {
+                let plain = self.model.vlm.decoder.embed(&s.ids).unwrap();
+                self.model.add_glimpses(plain, &[(&self.prefix.image, &s.glimpses)]).unwrap()
+            })
+            .collect();
+        Tensor::cat(&embedded, 0).unwrap()
+    }
+
     /// Hidden states of the last tokens of prefix and suffix, read in one run without any cache before it.
     fn alone(&self, suffix: &Tokens) -> Tensor {
         let decoder = &self.model.vlm.decoder;
-        let own = decoder.embed(&suffix.ids).unwrap();
+        let own = self.embed(std::slice::from_ref(suffix));
         let positions: Vec<Position> = self.positions.iter().chain(&suffix.positions).copied().collect();
         let embedded = Tensor::cat(&[&self.embedded, &own], 0).unwrap();
         let hidden = self.model.vlm.prefill(&embedded, &positions, &mut decoder.cache(1)).unwrap();
@@ -77,19 +96,17 @@ impl Setup {
     /// Hidden states of equally long suffixes, one after the other, against the shared prefix.
     fn together(&self, suffixes: &[Tokens]) -> Tensor {
         let decoder = &self.model.vlm.decoder;
-        let ids: Vec<u32> = suffixes.iter().flat_map(|s| s.ids.clone()).collect();
         let positions: Vec<Position> = suffixes.iter().flat_map(|s| s.positions.clone()).collect();
         let table = decoder.rope().table(&positions, &Device::Cpu).unwrap();
         let mut own = decoder.cache(suffixes.len());
         let context = Context::Cached { shared: Some(&self.prefix.cache), own: &mut own };
-        decoder.forward(&decoder.embed(&ids).unwrap(), &table, context, None).unwrap()
+        decoder.forward(&self.embed(suffixes), &table, context, None).unwrap()
     }
 
     /// The same as the trainer packs it: prefix and suffixes in one sequence, no cache.
     fn packed(&self, suffixes: &[Tokens]) -> Tensor {
         let decoder = &self.model.vlm.decoder;
-        let ids: Vec<u32> = suffixes.iter().flat_map(|s| s.ids.clone()).collect();
-        let embedded = Tensor::cat(&[&self.embedded, &decoder.embed(&ids).unwrap()], 0).unwrap();
+        let embedded = Tensor::cat(&[&self.embedded, &self.embed(suffixes)], 0).unwrap();
         let own = suffixes.iter().flat_map(|s| &s.positions);
         let positions: Vec<Position> = self.positions.iter().chain(own).copied().collect();
         let table = decoder.rope().table(&positions, &Device::Cpu).unwrap();
@@ -263,6 +280,7 @@ fn the_prefix_matters() {
     let table = decoder.rope().table(&suffix.positions, &Device::Cpu).unwrap();
     let mut own = decoder.cache(1);
     let context = Context::Cached { shared: None, own: &mut own };
-    let without = decoder.forward(&decoder.embed(&suffix.ids).unwrap(), &table, context, None).unwrap();
+    let without =
+        decoder.forward(&setup.embed(std::slice::from_ref(&suffix)), &table, context, None).unwrap();
     assert!(relative_difference(&without, &setup.alone(&suffix)) > 1e-2);
 }

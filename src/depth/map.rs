@@ -4,7 +4,7 @@ use std::path::Path;
 
 use ndarray::ArrayView2;
 
-use super::{DepthScale, SparseDepth, check_length, files, is_valid, npy, pixel_count, png16, view2};
+use super::{DepthScale, SparseDepth, check_length, is_valid, npy, pixel_count, png16, view2};
 use crate::error::{Error, Result};
 
 /// Dense depth in metres (Z-depth) with a confidence, an expected error and a "measured" mark per pixel, all row-major.
@@ -175,7 +175,7 @@ impl DepthMap {
     /// [`Error::Format`] if the encoder fails, [`Error::Io`]; the file is then as it was before.
     pub fn write_png16(&self, path: impl AsRef<Path>, scale: DepthScale) -> Result<Saturation> {
         let (bytes, saturation) = self.to_png16(scale)?;
-        files::write_whole(path.as_ref(), &bytes)?;
+        crate::files::write_whole(path.as_ref(), &bytes)?;
         Ok(saturation)
     }
 

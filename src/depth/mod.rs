@@ -4,7 +4,6 @@
 //! values; x grows to the right, y grows downwards; a missing value is NaN in memory and 0 in integer files.
 
 pub mod colour;
-mod files;
 pub mod interpolate;
 mod label;
 mod map;

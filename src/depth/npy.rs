@@ -7,7 +7,7 @@ use std::fs::File;
 use std::io::Read;
 use std::path::Path;
 
-use super::{check_length, files, pixel_count};
+use super::{check_length, pixel_count};
 use crate::error::{Error, Result};
 
 /// A 2-D array: shape (height, width), row-major.
@@ -52,7 +52,7 @@ pub fn read_npy(path: impl AsRef<Path>) -> Result<Npy> {
 /// [`Error::ImageSize`], [`Error::BufferLength`] unless there are `width * height` values, [`Error::Io`]; the file is then as
 /// it was before.
 pub fn write_npy(path: impl AsRef<Path>, width: usize, height: usize, values: &[f32]) -> Result<()> {
-    files::write_whole(path.as_ref(), &encode(width, height, values)?)
+    crate::files::write_whole(path.as_ref(), &encode(width, height, values)?)
 }
 
 /// The bytes of a version 1 file with f32 values, shape (height, width).

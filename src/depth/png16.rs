@@ -6,7 +6,7 @@ use std::path::Path;
 use image::codecs::png::{PngDecoder, PngEncoder};
 use image::{DynamicImage, ExtendedColorType, ImageEncoder};
 
-use super::{check_length, files, pixel_count};
+use super::{check_length, pixel_count};
 use crate::error::{Error, Result};
 
 const EXPECTED: &str = "a PNG with 16-bit grey pixels";
@@ -28,7 +28,7 @@ pub fn read_png16(path: impl AsRef<Path>) -> Result<(usize, usize, Vec<u16>)> {
 /// [`Error::ImageSize`], [`Error::BufferLength`], [`Error::Format`] if the encoder fails, [`Error::Io`]; the file is then as it
 /// was before.
 pub fn write_png16(path: impl AsRef<Path>, width: usize, height: usize, stored: &[u16]) -> Result<()> {
-    files::write_whole(path.as_ref(), &encode(width, height, stored)?)
+    crate::files::write_whole(path.as_ref(), &encode(width, height, stored)?)
 }
 
 /// The bytes of a PNG file with `width * height` integers.

@@ -6,7 +6,7 @@ use std::path::Path;
 use image::{Rgb, RgbImage};
 
 use super::colour::{self, ColourMap, confidence_to_rgb, depth_to_rgb, error_to_rgb};
-use super::{DepthMap, SparseDepth, check_length, files, is_valid, label};
+use super::{DepthMap, SparseDepth, check_length, is_valid, label};
 use crate::error::{Error, Result};
 
 const GAP: usize = 8;
@@ -81,7 +81,7 @@ pub fn write_panel(
     let picture = panel(rgb, sparse, dense, truth)?;
     let encoded = picture.write_to(&mut bytes, image::ImageFormat::Png);
     encoded.map_err(|e| Error::format(path, e.to_string(), "a picture that PNG can hold"))?;
-    files::write_whole(path, bytes.get_ref())
+    crate::files::write_whole(path, bytes.get_ref())
 }
 
 struct Tile {

@@ -12,8 +12,8 @@ const CHUNK: usize = 32 * 1024;
 /// `params`, `grad`, `m` and `v` have one length; `m` and `v` start as zeros and belong to these
 /// parameters. `step` counts from 1. `grad_scale` multiplies every gradient (1 for none; below 1 to
 /// clip or to average). A length that differs is
-/// [`Error::BufferLength`](crate::error::Error::BufferLength), `step` = 0
-/// [`Error::Argument`](crate::error::Error::Argument).
+/// [`Error::BufferLength`], `step` = 0
+/// [`Error::Argument`].
 #[allow(clippy::too_many_arguments)]
 pub fn adamw_step(
     params: &mut [f32],

@@ -13,7 +13,7 @@ const CHUNK: usize = 16 * 1024;
 ///
 /// `x` is `[n, heads * hd]`, `cos` and `sin` `[n, hd/2]`, the same for all heads; gives `[n, heads *
 /// hd]`. Differentiable in `x`; `cos` and `sin` are constants. Shapes that do not fit are
-/// [`Error::Argument`](crate::error::Error::Argument).
+/// [`Error::Argument`].
 pub fn rope(x: &Tensor, cos: &Tensor, sin: &Tensor, heads: usize) -> Result<Tensor> {
     let (n, width) = dims2("x", x)?;
     if heads == 0 || width % (2 * heads) != 0 {

@@ -26,6 +26,8 @@ pub struct Prefix {
 
 /// Rows of one decoder pass, at most: large enough for efficient products, small enough for the caches.
 const ROWS: usize = 4096;
+/// Queries whose prompts are written at a time, so that memory does not grow with their number.
+const CHUNK: usize = 4 * ROWS;
 
 /// Asks all queries and returns one reading each, in metres, in their order.
 ///
@@ -35,6 +37,20 @@ const ROWS: usize = 4096;
 /// # Errors
 /// [`crate::Error::Cancelled`] if `progress` said so; tensor and tokenizer errors.
 pub fn ask(
+    model: &SdimModel,
+    prefix: &Prefix,
+    queries: &[Query],
+    progress: &mut dyn FnMut(usize) -> bool,
+) -> Result<Vec<Reading>> {
+    let mut readings = Vec::with_capacity(queries.len());
+    for chunk in queries.chunks(CHUNK) {
+        let before = readings.len();
+        readings.extend(ask_chunk(model, prefix, chunk, &mut |done| progress(before + done))?);
+    }
+    Ok(readings)
+}
+
+fn ask_chunk(
     model: &SdimModel,
     prefix: &Prefix,
     queries: &[Query],
@@ -99,8 +115,7 @@ fn ask_batch(
             let mut alive = vec![true; batch.len()];
             let number_ids = &model.prompts.numbers().ids;
             // Text position of the first digit: one past the last text token of each suffix.
-            let mut next: Vec<f32> =
-                batch.iter().map(|&i| next_position(&suffixes[i], &prefix.space)).collect();
+            let mut next: Vec<f32> = batch.iter().map(|&i| suffixes[i].next_text(&prefix.space)).collect();
             loop {
                 let rows: Vec<f32> = logits.flatten_all()?.to_vec1()?;
                 let mut ids = vec![number_ids[0]; batch.len()];
@@ -124,12 +139,6 @@ fn ask_batch(
             }
         }
     }
-}
-
-/// The position of the token after a suffix: pointer tokens do not count, they stand at their pixels.
-fn next_position(suffix: &Tokens, space: &FrameSpace) -> f32 {
-    let text = suffix.positions.iter().filter(|p| p.t == p.h && p.h == p.w && p.t >= space.next);
-    text.last().map_or(space.next, |p| p.t + 1.0)
 }
 
 /// Reads one more run of tokens per item and returns the number rows of the output head at each item's last token,

@@ -105,8 +105,9 @@ impl Numbers {
         Ok(Self { format, ids })
     }
 
-    /// The tokens of a value in units, as indices into `ids`. Values out of range are clamped.
+    /// The tokens of a value in units, as indices into `ids`. Values out of range are clamped, NaN is 0.
     pub fn write(&self, value: f32) -> Vec<usize> {
+        let value = if value.is_nan() { 0.0 } else { value };
         match self.format {
             NumberFormat::Bins { bins, range } => {
                 let k = (f64::from(value) / range * bins as f64).floor();

@@ -10,7 +10,8 @@ pub enum QueryPlan {
     Every,
     /// A lattice: each N-th column and row.
     Stride(usize),
-    /// At most this many pixels: half of them on a lattice, then where neighbours disagree or the answer is unsure.
+    /// At most this many pixels (those of the alignment come on top): half of them on a lattice, then where neighbours
+    /// disagree or the answer is unsure.
     Budget(usize),
 }
 

@@ -3,7 +3,7 @@
 use super::number::{DepthUnit, Numbers};
 use super::settings::{MeasurementPrompt, PixelReference, Settings};
 use crate::depth::SparseDepth;
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::vlm::config::VlmConfig;
 use crate::vlm::grid::Grid;
 use crate::vlm::prompt::positions;
@@ -51,6 +51,12 @@ impl Tokens {
         });
         let position = space.pixel(x as f32, y as f32, time);
         ids.iter().for_each(|&id| self.push(id, position));
+    }
+
+    /// Position of a text token that follows this suffix: tokens at pixels do not count, they stand elsewhere.
+    pub fn next_text(&self, space: &FrameSpace) -> f32 {
+        let mut texts = self.positions.iter().filter(|p| p.t == p.h && p.h == p.w && p.t >= space.next);
+        texts.next_back().map_or(space.next, |p| p.t + 1.0)
     }
 
     /// Number of tokens.
@@ -203,6 +209,22 @@ impl PromptWriter {
         config: &VlmConfig,
         seed: u64,
     ) -> Result<(Tokens, FrameSpace)> {
+        self.prefix_of(sparse, usize::MAX, grid, resized, config, seed)
+    }
+
+    /// As [`PromptWriter::prefix`], with at most `points` measurements if that is fewer than the settings allow.
+    ///
+    /// # Errors
+    /// As [`PromptWriter::prefix`].
+    pub fn prefix_of(
+        &self,
+        sparse: &SparseDepth,
+        points: usize,
+        grid: Grid,
+        resized: (usize, usize),
+        config: &VlmConfig,
+        seed: u64,
+    ) -> Result<(Tokens, FrameSpace)> {
         let merged = grid.merged(config.vision.merge_size);
         let mut ids = self.before_image.clone();
         ids.extend(std::iter::repeat_n(config.ids.image, merged.0 * merged.1));
@@ -221,7 +243,7 @@ impl PromptWriter {
             unit: self.unit(sparse),
         };
         if let MeasurementPrompt::Prefix { max } = self.settings.measurements {
-            for (x, y, depth) in choose_evenly(sparse, max, seed) {
+            for (x, y, depth) in with_largest(choose_evenly(sparse, max.min(points), seed), sparse) {
                 tokens.push_at(&self.numbers.write_ids(depth / space.unit), (x, y), MEASURED_TIME, &space);
             }
         }
@@ -257,6 +279,14 @@ impl PromptWriter {
             }
         }
         text(&mut out, &self.forced);
+        if out.is_empty() {
+            return Err(Error::config(
+                "sdim.json",
+                "template.query",
+                "no token",
+                "at least one token per query",
+            ));
+        }
         Ok(out)
     }
 
@@ -279,6 +309,18 @@ impl PromptWriter {
     }
 }
 
+/// The largest measurement is what numbers are counted in, so it is always told: in the last one's place if need be.
+fn with_largest(mut chosen: Vec<(usize, usize, f32)>, sparse: &SparseDepth) -> Vec<(usize, usize, f32)> {
+    let top = sparse.points().max_by(|a, b| a.2.total_cmp(&b.2));
+    let told = |top: &_| chosen.contains(top);
+    if let Some(top) = top.filter(|top| !told(top))
+        && let Some(last) = chosen.last_mut()
+    {
+        *last = top;
+    }
+    chosen
+}
+
 /// At most `max` measurements, spread evenly over the frame, in a shuffled order that depends on the seed alone.
 ///
 /// With too many, the frame is cut into about `max` cells and each gives the measurement nearest to its centre; what
@@ -287,7 +329,8 @@ pub fn choose_evenly(sparse: &SparseDepth, max: usize, seed: u64) -> Vec<(usize,
     let mut points: Vec<(usize, usize, f32)> = sparse.points().collect();
     let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
     points.shuffle(&mut rng);
-    if points.len() <= max {
+    if points.len() <= max || max == 0 {
+        points.truncate(max);
         return points;
     }
     let side = ((sparse.width() * sparse.height()) as f32 / max as f32).sqrt().max(1.0);

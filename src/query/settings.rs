@@ -144,6 +144,9 @@ impl Settings {
         {
             return Err(Error::config(file, "fusion", format!("{f:?}"), "1 to 1024 channels each"));
         }
+        if self.measurements == (MeasurementPrompt::Prefix { max: 0 }) {
+            return Err(Error::config(file, "measurements.max", "0", "at least 1, or the kind `none`"));
+        }
         if self.glimpse.is_some_and(|side| !(1..=64).contains(&side)) {
             return Err(Error::config(
                 file,

@@ -78,7 +78,14 @@ impl PromptTemplate {
         };
         need("template.query", &self.query, "{pixel}", 1..=1)?;
         need("template.query", &self.query, "{mask}", 0..=1)?;
-        need("template.answer", &self.answer, "{y}", 1..=1)
+        need("template.answer", &self.answer, "{y}", 1..=1)?;
+        for part in ["{col}", "{row}"] {
+            need("template.coordinates", &self.coordinates, part, 1..=1)?;
+        }
+        if self.query.contains("{mask}") {
+            need("template.mask_measured", &self.mask_measured, "{x}", 1..=1)?;
+        }
+        Ok(())
     }
 
     /// The answer's words before the number.

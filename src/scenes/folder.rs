@@ -38,15 +38,15 @@ struct Entry {
 #[derive(Clone, Debug)]
 pub struct FolderDataset {
     entries: Vec<Entry>,
-    scale: DepthScale,
+    scale: Option<DepthScale>,
 }
 
 impl FolderDataset {
-    /// Lists `dir`. `scale` is the unit of its 16-bit PNGs and integer npy files.
+    /// Lists `dir`. `scale` is the unit of its 16-bit PNGs and integer npy files; without one, loading such a file fails.
     ///
     /// Fails with [`Error::Io`] when `rgb` or `gt` cannot be listed, and with [`Error::Format`] naming the file when a
     /// picture has no ground truth, a ground truth or measurement no picture, or there is no frame at all.
-    pub fn open(dir: impl AsRef<Path>, scale: DepthScale) -> Result<Self> {
+    pub fn open(dir: impl AsRef<Path>, scale: impl Into<Option<DepthScale>>) -> Result<Self> {
         let dir = dir.as_ref();
         let pictures = list(&dir.join("rgb"), &PICTURES)?;
         let mut truths = list(&dir.join("gt"), &DEPTHS)?;
@@ -74,7 +74,7 @@ impl FolderDataset {
         if entries.is_empty() {
             return Err(Error::format(dir.join("rgb"), "no picture", "at least one .png or .jpg"));
         }
-        Ok(Self { entries, scale })
+        Ok(Self { entries, scale: scale.into() })
     }
 
     /// Number of frames, at least 1.
@@ -107,7 +107,7 @@ impl FolderDataset {
     }
 
     fn depth(&self, path: &Path, rgb: &RgbImage) -> Result<SparseDepth> {
-        let map = SparseDepth::read(path, Some(self.scale))?;
+        let map = SparseDepth::read(path, self.scale)?;
         let (w, h) = (rgb.width() as usize, rgb.height() as usize);
         if (map.width(), map.height()) != (w, h) {
             let found = format!("{}x{} pixels", map.width(), map.height());
@@ -151,8 +151,8 @@ pub fn write_frame(dir: impl AsRef<Path>, name: &str, frame: &RgbdFrame, store: 
 }
 
 fn in_units(metres: f32, scale: DepthScale) -> u16 {
-    let units = (metres * scale.units()).round();
-    if units > 0.0 && units <= f32::from(u16::MAX) { units as u16 } else { 0 }
+    let (stored, saturated) = scale.stored(metres);
+    if saturated { 0 } else { stored }
 }
 
 /// Files of a folder with one of the endings: (name without ending, path), sorted. Two files of one name are an error.
@@ -200,7 +200,7 @@ mod tests {
         assert!(exact.gt.iter().zip(&a.depth).all(|(x, y)| x == y || (x.is_nan() && y.is_nan())));
         let rounded = set.load(0).unwrap();
         for (x, y) in rounded.gt.iter().zip(&b.depth) {
-            assert!((x - y).abs() <= 0.00051 || (x.is_nan() && !(*y < 65.5)), "{x} {y}");
+            assert!((x - y).abs() <= 0.00051 || (x.is_nan() && (*y >= 65.5 || y.is_nan())), "{x} {y}");
         }
         assert!(matches!(set.load(2), Err(Error::Argument { .. })));
     }

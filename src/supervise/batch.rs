@@ -4,8 +4,8 @@ use crate::depth::SparseDepth;
 use crate::depth::interpolate::Interpolator;
 use crate::error::Result;
 use crate::model::{SdimModel, scatter};
+use crate::query::Query;
 use crate::query::prompt::Tokens;
-use crate::query::{MeasurementPrompt, Query};
 use crate::scenes::{RgbdFrame, SparsePattern, procedural};
 use crate::vlm::grid::Grid;
 use crate::vlm::preprocess::Pixels;
@@ -78,6 +78,9 @@ pub struct Item {
     pub answer: Vec<usize>,
     /// The answer in number units.
     pub value: f32,
+    /// The frame's largest measurement in number units: what its errors are counted in, so that frames of near and of
+    /// far things weigh alike.
+    pub largest: f32,
 }
 
 /// Mixes a run's seed with a counter, so that neighbouring streams share nothing.
@@ -126,30 +129,13 @@ fn example(model: &SdimModel, config: &BatchConfig, seed: u64, size: (usize, usi
         width: width / merge * model.vlm.config.vision.merge_size,
     };
     let writer = &model.prompts;
-    let shown = match writer.settings().measurements {
-        MeasurementPrompt::Prefix { .. } => {
-            let chosen = crate::query::prompt::choose_evenly(&prompted, config.prompt_points, rng.random());
-            SparseDepth::from_points(width, height, &chosen)?
-        }
-        _ => prompted.clone(),
-    };
-    let (prefix, mut space) =
-        writer.prefix(&shown, grid, (width, height), &model.vlm.config, rng.random())?;
-    space.unit = writer.unit(&prompted);
-    let prefix = if space.unit == writer.unit(&shown) {
-        prefix
-    } else {
-        // The largest measurement was not among the chosen: say the numbers in the unit of all of them.
-        let top = prompted.points().max_by(|a, b| a.2.total_cmp(&b.2));
-        let mut chosen: Vec<_> = shown.points().collect();
-        chosen.extend(top);
-        let shown = SparseDepth::from_points(width, height, &chosen)?;
-        writer.prefix(&shown, grid, (width, height), &model.vlm.config, rng.random())?.0
-    };
+    let (prefix, space) =
+        writer.prefix_of(&prompted, config.prompt_points, grid, size, &model.vlm.config, rng.random())?;
 
     let points: Vec<(f32, f32)> = prompted.points().map(|(x, y, _)| (x as f32, y as f32)).collect();
     let values: Vec<f32> = prompted.points().map(|p| p.2).collect();
     let interpolator = Interpolator::new(&points, width, height)?;
+    let largest = prompted.max().unwrap_or(space.unit) / space.unit;
     let mut items = Vec::with_capacity(config.questions);
     for (x, y, depth) in questions(&frame, held_back.as_ref(), config.questions, &mut rng) {
         let query =
@@ -157,13 +143,13 @@ fn example(model: &SdimModel, config: &BatchConfig, seed: u64, size: (usize, usi
         let mut tokens = writer.suffix(&query, &space, &model.tokenizer)?;
         let value = depth / space.unit;
         let answer = writer.numbers().write(value);
-        let mut p = tokens.positions.last().map_or(space.next, |p| p.t + 1.0);
+        let mut p = tokens.next_text(&space);
         for &digit in &answer[..answer.len() - 1] {
             tokens.ids.push(writer.numbers().ids[digit]);
             tokens.positions.push(crate::vlm::rope::Position::text(p));
             p += 1.0;
         }
-        items.push(Item { tokens, supervised: answer.len(), answer, value });
+        items.push(Item { tokens, supervised: answer.len(), answer, value, largest });
     }
     items.sort_by_key(|i| i.tokens.len());
     let scattered = scatter(&prompted, width, height, space.unit);

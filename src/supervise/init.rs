@@ -180,9 +180,9 @@ pub fn initial(
         let count: usize = shape.iter().product();
         let fan_in = (count / shape[0]) as f32;
         let residual = 0.5 / (2.0 * layers as f32).sqrt();
-        let std = if name.ends_with("bias") || name.ends_with("running_mean") {
-            0.0
-        } else if name.starts_with("sdim.fusion.depth.conv")
+        let std = if name.ends_with("bias")
+            || name.ends_with("running_mean")
+            || name.starts_with("sdim.fusion.depth.conv")
             || name.starts_with("sdim.fusion.out")
             || name.starts_with("sdim.glimpse")
         {

@@ -60,10 +60,10 @@ impl BinLossOp {
         let log_total = total.ln() + max;
 
         let mut loss = 0f64;
-        for k in 0..bins {
-            let p = grad[k] / total;
+        for (k, g) in grad.iter_mut().enumerate() {
+            let p = *g / total;
             // d|mean - t|/dlogit = sign * p * (centre - mean)
-            grad[k] = p + sign * p * (centre(k) - mean);
+            *g = p + sign * p * (centre(k) - mean);
         }
         for k in from..to {
             let q = blurred(k) / mass;

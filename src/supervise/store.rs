@@ -3,16 +3,10 @@
 use super::init::FreshFiles;
 use super::optimiser::Parameters;
 use crate::error::{Error, Result};
+use crate::files::write_whole;
 use candle_core::{DType, Device, Tensor};
 use std::collections::HashMap;
 use std::path::Path;
-
-fn write(path: &Path, bytes: &[u8]) -> Result<()> {
-    // A reader never sees half a file, and a crash leaves the old one.
-    let partial = path.with_extension("partial");
-    std::fs::write(&partial, bytes).map_err(Error::io(&partial))?;
-    std::fs::rename(&partial, path).map_err(Error::io(path))
-}
 
 fn serialise(path: &Path, tensors: &HashMap<String, Tensor>) -> Result<Vec<u8>> {
     safetensors::serialize(tensors, None)
@@ -30,14 +24,14 @@ pub fn publish(dir: &Path, files: &FreshFiles, parameters: &Parameters) -> Resul
         tensors.insert(name, tensor.to_dtype(DType::BF16)?);
     }
     let path = dir.join("model.safetensors");
-    write(&path, &serialise(&path, &tensors)?)?;
+    write_whole(&path, &serialise(&path, &tensors)?)?;
     for (name, text) in [
         ("config.json", &files.config),
         ("preprocessor_config.json", &files.preprocessor),
         ("sdim.json", &files.settings),
         ("tokenizer.json", &files.tokenizer),
     ] {
-        write(&dir.join(name), text.as_bytes())?;
+        write_whole(&dir.join(name), text.as_bytes())?;
     }
     Ok(())
 }
@@ -57,13 +51,14 @@ pub fn save_state(dir: &Path, parameters: &Parameters, step: usize) -> Result<()
     }
     tensors.insert("step".into(), Tensor::new(&[step as u32], &Device::Cpu)?);
     let path = dir.join("trainer.safetensors");
-    write(&path, &serialise(&path, &tensors)?)
+    write_whole(&path, &serialise(&path, &tensors)?)
 }
 
 /// Reads what [`save_state`] wrote and returns the number of finished steps.
 ///
 /// # Errors
-/// [`Error::Io`], [`Error::Format`] on a damaged file, [`Error::Tensor`] if it belongs to another model.
+/// [`Error::Io`], [`Error::Format`] on a damaged file, [`Error::Tensor`] or [`Error::TensorSet`] if it belongs to another
+/// model.
 pub fn load_state(dir: &Path, parameters: &mut Parameters) -> Result<usize> {
     let path = dir.join("trainer.safetensors");
     let file = path.display().to_string();
@@ -76,19 +71,29 @@ pub fn load_state(dir: &Path, parameters: &mut Parameters) -> Result<usize> {
         found: "missing or of another shape".into(),
         expected,
     };
-    for (name, p) in &mut parameters.all {
+    let known = |key: &str| key.split_once('/').is_some_and(|(_, name)| parameters.all.contains_key(name));
+    let mut unexpected: Vec<String> = state.keys().filter(|k| *k != "step" && !known(k)).cloned().collect();
+    if !unexpected.is_empty() {
+        unexpected.sort();
+        return Err(Error::TensorSet { file, missing: Vec::new(), unexpected });
+    }
+    let mut parts = Vec::with_capacity(parameters.all.len());
+    for (name, p) in &parameters.all {
         let read = |part: &str| -> Result<Vec<f32>> {
             match state.get(&format!("{part}/{name}")) {
                 Some(t) if t.shape() == p.var.shape() => Ok(t.flatten_all()?.to_vec1()?),
                 _ => Err(missing(&format!("{part}/{name}"), format!("{:?}", p.var.shape()))),
             }
         };
-        let (values, average) = (read("value")?, read("average")?);
-        (p.m, p.v) = (read("m")?, read("v")?);
+        parts.push((read("value")?, read("average")?, read("m")?, read("v")?));
+    }
+    let step = match state.get("step").map(|t| t.to_vec1::<u32>()) {
+        Some(Ok(step)) if step.len() == 1 => step[0] as usize,
+        _ => return Err(missing("step", "one u32".into())),
+    };
+    for (p, (values, average, m, v)) in parameters.all.values_mut().zip(parts) {
         p.set(&values, &average)?;
+        (p.m, p.v) = (m, v);
     }
-    match state.get("step").map(|t| t.to_vec1::<u32>()) {
-        Some(Ok(step)) if step.len() == 1 => Ok(step[0] as usize),
-        _ => Err(missing("step", "one u32".into())),
-    }
+    Ok(step)
 }

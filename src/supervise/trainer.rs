@@ -126,8 +126,16 @@ impl Trainer {
     /// # Errors
     /// [`Error::Io`], [`Error::Tensors`].
     pub fn save(&self, dir: &Path) -> Result<()> {
-        store::publish(dir, &self.files, &self.parameters)?;
+        self.publish(dir)?;
         store::save_state(dir, &self.parameters, self.step)
+    }
+
+    /// Writes the published checkpoint alone.
+    ///
+    /// # Errors
+    /// [`Error::Io`], [`Error::Tensors`].
+    pub fn publish(&self, dir: &Path) -> Result<()> {
+        store::publish(dir, &self.files, &self.parameters)
     }
 
     /// A model of the averaged weights, for evaluation.
@@ -243,7 +251,7 @@ impl Trainer {
                     for (i, &c) in item.answer.iter().enumerate() {
                         let exponent = point as i32 - i as i32 - i32::from(i < point);
                         chosen.push(c as u32);
-                        place.push(if c == POINT { 0.0 } else { 10f32.powi(exponent) });
+                        place.push(if c == POINT { 0.0 } else { 10f32.powi(exponent) / item.largest });
                         number.push(n as u32);
                     }
                 }

@@ -56,6 +56,9 @@ impl QwenVl {
             }
             let position = Position::text(next + answer.len() as f32);
             answer.push(id);
+            if answer.len() == options.max_new_tokens {
+                break;
+            }
             seen.push(id);
             hidden = self.prefill(&self.decoder.embed(&[id])?, &[position], &mut cache)?;
         }

@@ -19,7 +19,7 @@ pub mod weights;
 
 use crate::error::Result;
 use cache::KvCache;
-use candle_core::{DType, Tensor};
+use candle_core::Tensor;
 use config::VlmConfig;
 use decoder::{Context, Decoder};
 use grid::Grid;
@@ -59,7 +59,7 @@ impl QwenVl {
     /// Embeds a prompt and puts the image tokens in the places of the placeholders, in order: `[ids, hidden]`.
     ///
     /// # Errors
-    /// [`crate::Error::Argument`] on an id outside the vocabulary; [`crate::Error::Tensors`] if the counts differ.
+    /// [`crate::Error::Argument`] on an id outside the vocabulary or if the counts differ.
     pub fn embed_prompt(&self, ids: &[u32], image_tokens: &Tensor) -> Result<Tensor> {
         let text = self.decoder.embed(ids)?;
         let (mut parts, mut i, mut used) = (Vec::new(), 0, 0);
@@ -67,12 +67,20 @@ impl QwenVl {
             let is_image = ids[i] == self.config.ids.image;
             let run = ids[i..].iter().take_while(|&&id| (id == self.config.ids.image) == is_image).count();
             if is_image {
-                parts.push(image_tokens.narrow(0, used, run)?.to_dtype(DType::F32)?);
+                let left = image_tokens.dim(0)? - used;
+                if run > left {
+                    return Err(crate::Error::argument("image placeholders", run, format!("{left} more")));
+                }
+                parts.push(image_tokens.narrow(0, used, run)?);
                 used += run;
             } else {
                 parts.push(text.narrow(0, i, run)?);
             }
             i += run;
+        }
+        if used != image_tokens.dim(0)? {
+            let expected = format!("{} image tokens", image_tokens.dim(0)?);
+            return Err(crate::Error::argument("image placeholders", used, expected));
         }
         Ok(Tensor::cat(&parts, 0)?)
     }

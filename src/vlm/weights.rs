@@ -18,6 +18,8 @@ const STAND_INS: usize = 1 << 28;
 pub struct Weights {
     file: String,
     tensors: HashMap<String, Tensor>,
+    /// File of each tensor that did not come from `file`.
+    origin: HashMap<String, String>,
     read: RefCell<BTreeSet<String>>,
     missing: RefCell<BTreeMap<String, Vec<usize>>>,
 }
@@ -46,7 +48,13 @@ pub fn published_name(name: &str) -> String {
 impl Weights {
     /// Tensors that are already in memory (the trainer's variables, tests). `file` is for messages.
     pub fn from_tensors(file: &str, tensors: HashMap<String, Tensor>) -> Self {
-        Self { file: file.to_string(), tensors, read: RefCell::default(), missing: RefCell::default() }
+        Self {
+            file: file.to_string(),
+            tensors,
+            origin: HashMap::new(),
+            read: RefCell::default(),
+            missing: RefCell::default(),
+        }
     }
 
     /// Reads safetensors bytes and converts each tensor to `dtype` on `device`.
@@ -55,7 +63,7 @@ impl Weights {
     /// [`Error::Format`] if the bytes are truncated or no safetensors; [`Error::Tensor`] on an integer tensor.
     pub fn from_bytes(file: &str, bytes: &[u8], dtype: DType, device: &Device) -> Result<Self> {
         let mut weights = Self::from_tensors(file, HashMap::new());
-        weights.add_bytes(bytes, dtype, device)?;
+        weights.add_bytes(file, bytes, dtype, device)?;
         Ok(weights)
     }
 
@@ -64,7 +72,7 @@ impl Weights {
     /// # Errors
     /// As [`Weights::from_bytes`], and [`Error::Io`].
     pub fn from_file(path: &Path, dtype: DType, device: &Device) -> Result<Self> {
-        let mut weights = Self::from_tensors("", HashMap::new());
+        let mut weights = Self::from_tensors(&path.display().to_string(), HashMap::new());
         weights.add_file(path, dtype, device)?;
         Ok(weights)
     }
@@ -78,13 +86,12 @@ impl Weights {
         // SAFETY: the map is read-only and lives for this call. That nobody truncates the file meanwhile is the caller's
         // part, as with any program that maps its weights; a file that is short to begin with is refused below.
         let bytes = unsafe { memmap2::Mmap::map(&file) }.map_err(Error::io(path))?;
-        self.file = path.display().to_string();
-        self.add_bytes(&bytes, dtype, device)
+        self.add_bytes(&path.display().to_string(), &bytes, dtype, device)
     }
 
-    fn add_bytes(&mut self, bytes: &[u8], dtype: DType, device: &Device) -> Result<()> {
+    fn add_bytes(&mut self, from: &str, bytes: &[u8], dtype: DType, device: &Device) -> Result<()> {
         let bad = |e: safetensors::SafeTensorError| {
-            Error::format(&self.file, e.to_string(), "a complete safetensors file")
+            Error::format(from, e.to_string(), "a complete safetensors file")
         };
         let file = safetensors::SafeTensors::deserialize(bytes).map_err(bad)?;
         for (name, view) in file.tensors() {
@@ -94,7 +101,7 @@ impl Weights {
                 safetensors::Dtype::BF16 => DType::BF16,
                 other => {
                     return Err(Error::Tensor {
-                        file: self.file.clone(),
+                        file: from.to_string(),
                         name,
                         found: format!("{other:?}"),
                         expected: "F32, F16 or BF16".into(),
@@ -106,7 +113,11 @@ impl Weights {
             } else {
                 Tensor::from_raw_buffer(view.data(), stored, view.shape(), device)?.to_dtype(dtype)?
             };
-            self.tensors.insert(published_name(&name), tensor);
+            let name = published_name(&name);
+            if from != self.file {
+                self.origin.insert(name.clone(), from.to_string());
+            }
+            self.tensors.insert(name, tensor);
         }
         Ok(())
     }
@@ -129,7 +140,7 @@ impl Weights {
         };
         if tensor.dims() != shape {
             return Err(Error::Tensor {
-                file: self.file.clone(),
+                file: self.origin.get(name).unwrap_or(&self.file).clone(),
                 name: name.to_string(),
                 found: format!("shape {:?}", tensor.dims()),
                 expected: format!("shape {shape:?}"),
