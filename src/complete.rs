@@ -244,6 +244,9 @@ impl DepthCompleter {
     }
 }
 
+/// A pixel and what was answered there.
+type PixelReading = ((usize, usize), Reading);
+
 /// Measurement minus answer at the pixels that were asked for the alignment.
 #[derive(Default)]
 struct Residual {
@@ -301,7 +304,7 @@ impl<'a> Frame<'a> {
     }
 
     /// Asks the plan's pixels and those of the alignment.
-    fn ask_all(&self) -> Result<(Vec<((usize, usize), Reading)>, Residual)> {
+    fn ask_all(&self) -> Result<(Vec<PixelReading>, Residual)> {
         let (width, height) = (self.sparse.width(), self.sparse.height());
         let (first, stride, budget) = match self.options.plan {
             QueryPlan::Every => (lattice(width, height, 1), 1, 0),
@@ -364,12 +367,7 @@ impl<'a> Frame<'a> {
     }
 
     /// Aligns the answers, fills the rest, keeps the measurements.
-    fn dense(
-        &self,
-        rgb: &RgbImage,
-        answers: Vec<((usize, usize), Reading)>,
-        residual: &Residual,
-    ) -> Result<DepthMap> {
+    fn dense(&self, rgb: &RgbImage, answers: Vec<PixelReading>, residual: &Residual) -> Result<DepthMap> {
         let (width, height) = (self.sparse.width(), self.sparse.height());
         let shift = if residual.points.is_empty() {
             None

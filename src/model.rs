@@ -173,8 +173,8 @@ impl SdimModel {
         Ok(self)
     }
 
-    /// Loads a checkpoint directory: `config.json`, `preprocessor_config.json`, `tokenizer.json`, `model.safetensors`,
-    /// and `sdim.json` if it has one.
+    /// Loads a checkpoint directory: `config.json`, `preprocessor_config.json`, `tokenizer.json`, `model.safetensors` or its
+    /// shards with their index, and `sdim.json` if it has one.
     ///
     /// # Errors
     /// Typed errors that name the file, key or tensor.
@@ -189,7 +189,7 @@ impl SdimModel {
     /// Typed errors that name the file, key or tensor.
     pub fn load_adapted(dir: &Path, adapter: Option<&Path>, device: &Device) -> Result<Self> {
         let mut files = CheckpointFiles::from_dir(dir)?;
-        let mut weights = Weights::from_file(&dir.join("model.safetensors"), DType::F32, device)?;
+        let mut weights = Weights::from_dir(dir, DType::F32, device)?;
         if let Some(adapter) = adapter {
             let path = adapter.join("sdim.json");
             files.settings = Settings::from_bytes(&path, &std::fs::read(&path).map_err(Error::io(&path))?)?;

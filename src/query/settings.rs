@@ -111,7 +111,7 @@ impl Settings {
             position_scale: 8.0,
             template: PromptTemplate::tiny(),
             pixel_reference: PixelReference::Pointer { token: "<|point|>".into() },
-            measurements: MeasurementPrompt::Prefix { max: 384 },
+            measurements: MeasurementPrompt::Prefix { max: 1024 },
             hint: Hint::Linear,
             glimpse: Some(8),
             number: NumberFormat::Bins { bins: 1000, range: 1.25 },

@@ -13,6 +13,7 @@ pub mod preprocess;
 pub mod prompt;
 pub mod resize;
 pub mod rope;
+mod shards;
 pub mod tokenizer;
 pub mod vision;
 pub mod weights;
