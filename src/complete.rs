@@ -6,8 +6,9 @@ use crate::error::{Error, Result};
 use crate::model::SdimModel;
 use crate::query::plan::{Asked, lattice, refine_pixels, stride_within};
 use crate::query::prompt::choose_evenly;
-use crate::query::{Prefix, Query, QueryPlan, Reading, ask};
+use crate::query::{Hint, Prefix, Query, QueryPlan, Reading, ask};
 use crate::refine::{Answered, EdgeAwareFill, Fill, FillInput};
+use crate::vlm::preprocess::MAX_RATIO;
 use candle_core::Device;
 use image::RgbImage;
 use std::path::Path;
@@ -126,8 +127,6 @@ const ALIGN_POINTS: usize = 2048;
 
 /// Smallest side of a frame, pixels: one merged token of the published checkpoints.
 const MIN_SIDE: usize = 28;
-/// Largest aspect ratio of a frame, as in the published preprocessing.
-const MAX_RATIO: usize = 200;
 
 /// A loaded checkpoint, ready for frames. Cheap to clone and to share between threads.
 #[derive(Clone)]
@@ -260,7 +259,7 @@ struct Frame<'a> {
     prefix: &'a Prefix,
     sparse: &'a SparseDepth,
     options: &'a CompleteOptions,
-    /// Linear interpolation of all measurements, metres: the hint, if the checkpoint wants one.
+    /// Linear interpolation of all measurements, metres; empty if the checkpoint takes no hint.
     hint: Vec<f32>,
 }
 
@@ -271,13 +270,16 @@ impl<'a> Frame<'a> {
         sparse: &'a SparseDepth,
         options: &'a CompleteOptions,
     ) -> Result<Self> {
-        let hint = crate::depth::interpolate::linear(sparse)?;
+        let hint = match model.prompts.settings().hint {
+            Hint::Linear => crate::depth::interpolate::linear(sparse)?,
+            Hint::None => Vec::new(),
+        };
         Ok(Self { model, prefix, sparse, options, hint })
     }
 
     /// What is asked at a pixel; `tell` states its measurement where the template has a place for it.
     fn query(&self, (x, y): (usize, usize), tell: bool) -> Query {
-        let hint = self.hint[y * self.sparse.width() + x];
+        let hint = self.hint.get(y * self.sparse.width() + x).copied().unwrap_or(f32::NAN);
         Query { x, y, measured: self.sparse.get(x, y).filter(|_| tell), hint }
     }
 

@@ -12,7 +12,7 @@
 use crate::error::Result;
 use crate::kernels;
 use crate::vlm::weights::Weights;
-use candle_core::{DType, Tensor};
+use candle_core::Tensor;
 
 /// Epsilon of the batch normalisation.
 pub const BN_EPS: f64 = 1e-5;
@@ -171,7 +171,7 @@ impl Fusion {
     pub fn forward(&self, rgb: &Tensor, sparse: &Tensor, mut normalise: Normalise) -> Result<Tensor> {
         let f = self.rgb.forward(rgb, &mut normalise)?;
         let s = self.depth.forward(sparse, &mut normalise)?;
-        let joined = Tensor::cat(&[f, s], 3)?.to_dtype(DType::F32)?;
+        let joined = Tensor::cat(&[f, s], 3)?;
         let m = self.high.forward(&joined, &mut normalise)?;
         let m = self.low.forward(&m, &mut normalise)?;
         kernels::conv3x3(&m, &self.out, Some(&self.out_bias))

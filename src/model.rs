@@ -7,6 +7,7 @@ use crate::query::prompt::Glimpse;
 use crate::query::{Prefix, PromptWriter, Settings};
 use crate::vlm::QwenVl;
 use crate::vlm::config::{VlmConfig, read_json};
+use crate::vlm::grid::Grid;
 use crate::vlm::linear::Linear;
 use crate::vlm::patch_embed::PatchEmbed;
 use crate::vlm::preprocess::{Pixels, PreprocessorConfig};
@@ -102,11 +103,7 @@ impl CheckpointFiles {
         let (file, value) = json("preprocessor_config.json")?;
         let preprocessor = PreprocessorConfig::from_json(&file, &value)?;
         let path = dir.join("sdim.json");
-        let settings = if path.exists() {
-            Settings::from_bytes(&path, &std::fs::read(&path).map_err(Error::io(&path))?)?
-        } else {
-            Settings::paper()
-        };
+        let settings = if path.exists() { Settings::from_file(&path)? } else { Settings::paper() };
         Ok(Self {
             config,
             preprocessor,
@@ -191,8 +188,7 @@ impl SdimModel {
         let mut files = CheckpointFiles::from_dir(dir)?;
         let mut weights = Weights::from_dir(dir, DType::F32, device)?;
         if let Some(adapter) = adapter {
-            let path = adapter.join("sdim.json");
-            files.settings = Settings::from_bytes(&path, &std::fs::read(&path).map_err(Error::io(&path))?)?;
+            files.settings = Settings::from_file(&adapter.join("sdim.json"))?;
             weights.add_file(&adapter.join("sdim.safetensors"), DType::F32, device)?;
         }
         Self::new(files, &weights, device)?.fold()
@@ -220,15 +216,32 @@ impl SdimModel {
     /// # Errors
     /// [`Error::Tensors`] on mismatched shapes.
     pub fn encode(&self, pixels: &Pixels, scattered: &Tensor) -> Result<Tensor> {
-        let patches = self.preprocessor.patches(pixels, &self.device)?;
+        self.encode_batch(&[pixels], scattered, Normalise::Running)
+    }
+
+    /// Image tokens of frames of one size, one frame after the other; `scattered` is `[frames, h, w, 1]`.
+    ///
+    /// # Errors
+    /// [`Error::Tensors`] on mismatched shapes.
+    pub fn encode_batch(
+        &self,
+        frames: &[&Pixels],
+        scattered: &Tensor,
+        normalise: Normalise,
+    ) -> Result<Tensor> {
+        let grids: Vec<Grid> = frames.iter().map(|p| p.grid).collect();
+        let patches = frames.iter().map(|p| self.preprocessor.patches(p, &self.device));
+        let patches = Tensor::cat(&patches.collect::<Result<Vec<_>>>()?, 0)?;
         let mut embedded = self.vlm.vision.patch_embed.forward(&patches)?; // F_e1(I)
         if let Some(injection) = &self.injection {
-            let rgb = self.preprocessor.image(pixels, &self.device)?.unsqueeze(0)?;
-            let o = injection.fusion.forward(&rgb, scattered, Normalise::Running)?;
-            let tokens = injection.patch_embed.forward_image(&o.squeeze(0)?, pixels.grid)?;
-            embedded = (embedded + tokens)?; // Eq. 3a
+            let images = frames.iter().map(|p| self.preprocessor.image(p, &self.device));
+            let rgb = Tensor::stack(&images.collect::<Result<Vec<_>>>()?, 0)?;
+            let o = injection.fusion.forward(&rgb, scattered, normalise)?;
+            let tokens = grids.iter().enumerate();
+            let tokens = tokens.map(|(i, &grid)| injection.patch_embed.forward_image(&o.get(i)?, grid));
+            embedded = (embedded + Tensor::cat(&tokens.collect::<Result<Vec<_>>>()?, 0)?)?; // Eq. 3a
         }
-        self.vlm.vision.encode(&embedded, &[pixels.grid])
+        self.vlm.vision.encode(&embedded, &grids)
     }
 
     /// Reads the shared prefix of a frame into a cache.

@@ -5,7 +5,7 @@ mod surfaces;
 use image::RgbImage;
 use rayon::prelude::*;
 
-use crate::depth::{SparseDepth, is_valid, pixel_count};
+use crate::depth::{SparseDepth, faces_a_hole, is_valid, pixel_count};
 use crate::error::{Error, Result};
 use surfaces::Surfaces;
 
@@ -181,13 +181,10 @@ fn check_answer(answer: &Answered, width: usize, height: usize) -> Result<()> {
 /// Answered pixels with an unanswered one among their eight neighbours. Only they can touch a pixel that is to be filled, so a
 /// frame that was asked densely costs little.
 fn rim(depth: &[f32], width: usize, height: usize) -> Vec<usize> {
-    let faces_a_hole = |&pixel: &usize| {
-        let (x, y) = (pixel % width, pixel / width);
-        let columns = x.saturating_sub(1)..(x + 2).min(width);
-        let mut rows = y.saturating_sub(1)..(y + 2).min(height);
-        !depth[pixel].is_nan() && rows.any(|row| columns.clone().any(|c| depth[row * width + c].is_nan()))
+    let at_a_hole = |&pixel: &usize| {
+        !depth[pixel].is_nan() && faces_a_hole(depth, width, height, pixel % width, pixel / width)
     };
-    (0..depth.len()).into_par_iter().filter(faces_a_hole).collect()
+    (0..depth.len()).into_par_iter().filter(at_a_hole).collect()
 }
 
 #[cfg(test)]

@@ -35,6 +35,13 @@ pub(crate) fn pixel_count(width: usize, height: usize) -> Result<usize> {
 /// Largest image accepted: 1 GiB of f32, far above any camera, far below what an attacker's header may claim.
 pub(crate) const MAX_PIXELS: usize = 1 << 28;
 
+/// Whether a pixel or one of the eight around it has no depth.
+pub(crate) fn faces_a_hole(depth: &[f32], width: usize, height: usize, x: usize, y: usize) -> bool {
+    let columns = x.saturating_sub(1)..(x + 2).min(width);
+    let mut rows = y.saturating_sub(1)..(y + 2).min(height);
+    rows.any(|row| depth[row * width..][columns.clone()].iter().any(|d| d.is_nan()))
+}
+
 /// Fails unless a buffer holds exactly one value per pixel.
 pub(crate) fn check_length(what: &'static str, found: usize, expected: usize) -> Result<()> {
     if found == expected { Ok(()) } else { Err(Error::BufferLength { what, expected, found }) }

@@ -42,14 +42,12 @@ impl Tokens {
 
     /// Tokens that say a number at a pixel; the first one carries the crop.
     fn push_at(&mut self, ids: &[u32], (x, y): (usize, usize), time: f32, space: &FrameSpace) {
-        let along =
-            |p: usize, size: usize, resized: usize| (p as f32 + 0.5) / size as f32 * resized as f32 - 0.5;
         self.glimpses.push(Glimpse {
             token: self.len(),
-            x: along(x, space.width, space.resized.0),
-            y: along(y, space.height, space.resized.1),
+            x: centre(x, space.width, space.resized.0),
+            y: centre(y, space.height, space.resized.1),
         });
-        let position = space.pixel(x as f32, y as f32, time);
+        let position = space.pixel(x, y, time);
         ids.iter().for_each(|&id| self.push(id, position));
     }
 
@@ -95,11 +93,16 @@ pub struct FrameSpace {
 const MEASURED_TIME: f32 = 1.0;
 const QUERY_TIME: f32 = 2.0;
 
+/// Where a pixel's centre falls on a coarser axis: 0 is the centre of its first cell.
+fn centre(p: usize, size: usize, cells: usize) -> f32 {
+    (p as f32 + 0.5) / size as f32 * cells as f32 - 0.5
+}
+
 impl FrameSpace {
     /// The M-RoPE position of a pixel's centre: fractional, in the units in which the image tokens count.
-    fn pixel(&self, x: f32, y: f32, time: f32) -> Position {
-        let along = |p: f32, size: usize, cells: usize| {
-            self.image_start + ((p + 0.5) / size as f32 * cells as f32 - 0.5) * self.position_scale
+    fn pixel(&self, x: usize, y: usize, time: f32) -> Position {
+        let along = |p: usize, size: usize, cells: usize| {
+            self.image_start + centre(p, size, cells) * self.position_scale
         };
         Position {
             t: self.image_start + time,

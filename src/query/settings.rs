@@ -131,6 +131,14 @@ impl Settings {
         Ok(settings)
     }
 
+    /// Reads `sdim.json`.
+    ///
+    /// # Errors
+    /// [`Error::Io`], and as [`Settings::from_bytes`].
+    pub fn from_file(path: &std::path::Path) -> Result<Self> {
+        Self::from_bytes(path, &std::fs::read(path).map_err(Error::io(path))?)
+    }
+
     fn validate(&self, file: &str) -> Result<()> {
         if self.format != FORMAT {
             return Err(Error::config(file, "format", self.format.to_string(), FORMAT.to_string()));

@@ -13,7 +13,7 @@ use crate::query::Settings;
 use crate::query::number::{NumberFormat, POINT};
 use crate::query::prompt::Glimpse;
 use crate::vlm::decoder::Context;
-use crate::vlm::grid::Grid;
+use crate::vlm::preprocess::Pixels;
 use crate::vlm::rope::Position;
 use crate::vlm::weights::Weights;
 use candle_core::{Device, Tensor};
@@ -263,23 +263,12 @@ impl Trainer {
 
     /// Image tokens of all examples, which have one size (Eq. 1-3).
     fn encode(&self, examples: &[Example], stats: Option<&mut Vec<BatchStats>>) -> Result<Tensor> {
-        let (model, device) = (&self.model, Device::Cpu);
-        let grids: Vec<Grid> = examples.iter().map(|e| e.pixels.grid).collect();
-        let patches = examples.iter().map(|e| model.preprocessor.patches(&e.pixels, &device));
-        let patches = Tensor::cat(&patches.collect::<Result<Vec<_>>>()?, 0)?;
-        let mut embedded = model.vlm.vision.patch_embed.forward(&patches)?;
-        if let Some(injection) = &model.injection {
-            let images = examples.iter().map(|e| model.preprocessor.image(&e.pixels, &device));
-            let rgb = Tensor::stack(&images.collect::<Result<Vec<_>>>()?, 0)?;
-            let (b, h, w, _) = rgb.dims4()?;
-            let sparse: Vec<f32> = examples.iter().flat_map(|e| e.scattered.iter().copied()).collect();
-            let sparse = Tensor::from_vec(sparse, (b, h, w, 1), &device)?;
-            let normalise = stats.map_or(Normalise::Running, Normalise::Batch);
-            let o = injection.fusion.forward(&rgb, &sparse, normalise)?;
-            let tokens = (0..b).map(|i| injection.patch_embed.forward_image(&o.get(i)?, grids[i]));
-            embedded = (embedded + Tensor::cat(&tokens.collect::<Result<Vec<_>>>()?, 0)?)?;
-        }
-        model.vlm.vision.encode(&embedded, &grids)
+        let frames: Vec<&Pixels> = examples.iter().map(|e| &e.pixels).collect();
+        let (width, height) = frames.first().map_or((0, 0), |p| p.resized.dimensions());
+        let sparse: Vec<f32> = examples.iter().flat_map(|e| e.scattered.iter().copied()).collect();
+        let shape = (examples.len(), height as usize, width as usize, 1);
+        let sparse = Tensor::from_vec(sparse, shape, &Device::Cpu)?;
+        self.model.encode_batch(&frames, &sparse, stats.map_or(Normalise::Running, Normalise::Batch))
     }
 }
 

@@ -28,6 +28,9 @@ pub struct PreprocessorConfig {
     pub image_std: [f32; 3],
 }
 
+/// Largest ratio of an image's sides that the published processor takes.
+pub const MAX_RATIO: usize = 200;
+
 /// An image as the encoder reads it.
 #[derive(Debug, Clone)]
 pub struct Pixels {
@@ -78,8 +81,8 @@ impl PreprocessorConfig {
     /// # Errors
     /// [`Error::ImageSize`] on an empty side or an aspect ratio over 200.
     pub fn smart_resize(&self, width: usize, height: usize) -> Result<(usize, usize)> {
-        if width == 0 || height == 0 || width.max(height) > 200 * width.min(height) {
-            let reason = "expected non-empty sides and an aspect ratio of at most 200".into();
+        if width == 0 || height == 0 || width.max(height) > MAX_RATIO * width.min(height) {
+            let reason = format!("expected non-empty sides and an aspect ratio of at most {MAX_RATIO}");
             return Err(Error::ImageSize { width, height, reason });
         }
         let factor = self.patch_size * self.merge_size;
