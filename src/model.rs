@@ -6,7 +6,8 @@ use crate::fusion::{Fusion, Normalise};
 use crate::query::prompt::Glimpse;
 use crate::query::{Prefix, PromptWriter, Settings};
 use crate::vlm::QwenVl;
-use crate::vlm::config::{VlmConfig, read_json};
+use crate::vlm::checkpoint::{CONFIG, PREPROCESSOR, Source, TOKENIZER, check_patches};
+use crate::vlm::config::VlmConfig;
 use crate::vlm::grid::Grid;
 use crate::vlm::linear::Linear;
 use crate::vlm::patch_embed::PatchEmbed;
@@ -47,6 +48,9 @@ pub struct SdimModel {
     pub device: Device,
 }
 
+/// What is ours about a checkpoint, beside the published files.
+const SETTINGS: &str = "sdim.json";
+
 /// The files of a checkpoint that are not tensors.
 pub struct CheckpointFiles {
     /// `config.json`
@@ -57,10 +61,6 @@ pub struct CheckpointFiles {
     pub settings: Settings,
     /// `tokenizer.json`
     pub tokenizer: Tokenizer,
-}
-
-fn parse(file: &Path, bytes: &[u8]) -> Result<serde_json::Value> {
-    serde_json::from_slice(bytes).map_err(|e| Error::format(file, e.to_string(), "valid JSON"))
 }
 
 impl CheckpointFiles {
@@ -75,18 +75,9 @@ impl CheckpointFiles {
         settings: &[u8],
         tokenizer: &[u8],
     ) -> Result<Self> {
-        let path = |name: &str| Path::new(dir).join(name);
-        let text = |name: &str| path(name).display().to_string();
-        let json = |name: &str, bytes: &[u8]| parse(&path(name), bytes);
-        Ok(Self {
-            config: VlmConfig::from_json(&text("config.json"), &json("config.json", config)?)?,
-            preprocessor: PreprocessorConfig::from_json(
-                &text("preprocessor_config.json"),
-                &json("preprocessor_config.json", preprocessor)?,
-            )?,
-            settings: Settings::from_bytes(&path("sdim.json"), settings)?,
-            tokenizer: Tokenizer::from_bytes(&path("tokenizer.json"), tokenizer)?,
-        })
+        let files =
+            [(CONFIG, config), (PREPROCESSOR, preprocessor), (SETTINGS, settings), (TOKENIZER, tokenizer)];
+        Self::read(&Source::memory(Path::new(dir), &files))
     }
 
     /// From a directory. Without `sdim.json` the checkpoint is plain Qwen2.5-VL, asked in the paper's words.
@@ -94,21 +85,19 @@ impl CheckpointFiles {
     /// # Errors
     /// Typed errors that name the file and key.
     pub fn from_dir(dir: &Path) -> Result<Self> {
-        let json = |name: &str| -> Result<(String, serde_json::Value)> {
-            let path = dir.join(name);
-            Ok((path.display().to_string(), read_json(&path)?))
-        };
-        let (file, value) = json("config.json")?;
-        let config = VlmConfig::from_json(&file, &value)?;
-        let (file, value) = json("preprocessor_config.json")?;
-        let preprocessor = PreprocessorConfig::from_json(&file, &value)?;
-        let path = dir.join("sdim.json");
-        let settings = if path.exists() { Settings::from_file(&path)? } else { Settings::paper() };
+        Self::read(&Source::dir(dir))
+    }
+
+    fn read(source: &Source) -> Result<Self> {
         Ok(Self {
-            config,
-            preprocessor,
-            settings,
-            tokenizer: Tokenizer::from_file(&dir.join("tokenizer.json"))?,
+            config: source.config()?,
+            preprocessor: source.preprocessor()?,
+            settings: if source.has(SETTINGS) {
+                Settings::from_bytes(&source.path(SETTINGS), &source.read(SETTINGS)?)?
+            } else {
+                Settings::paper()
+            },
+            tokenizer: source.tokenizer()?,
         })
     }
 }
@@ -120,16 +109,8 @@ impl SdimModel {
     /// [`Error::Config`] if the preprocessor's patches are not the model's; tensor and tokenizer errors.
     pub fn new(files: CheckpointFiles, weights: &Weights, device: &Device) -> Result<Self> {
         let CheckpointFiles { config, preprocessor, settings, tokenizer } = files;
+        check_patches(&preprocessor, &config)?;
         let v = &config.vision;
-        let patches = (preprocessor.patch_size, preprocessor.merge_size, preprocessor.temporal_patch_size);
-        if patches != (v.patch_size, v.merge_size, v.temporal_patch_size) {
-            return Err(Error::config(
-                "preprocessor_config.json",
-                "patch_size, merge_size, temporal_patch_size",
-                format!("{patches:?}"),
-                "the values of config.json",
-            ));
-        }
         let prompts = PromptWriter::new(&settings, &tokenizer)?;
         let injection = match &settings.fusion {
             Some(fusion) => Some(DepthInjection {
@@ -188,7 +169,7 @@ impl SdimModel {
         let mut files = CheckpointFiles::from_dir(dir)?;
         let mut weights = Weights::from_dir(dir, DType::F32, device)?;
         if let Some(adapter) = adapter {
-            files.settings = Settings::from_file(&adapter.join("sdim.json"))?;
+            files.settings = Settings::from_file(&adapter.join(SETTINGS))?;
             weights.add_file(&adapter.join("sdim.safetensors"), DType::F32, device)?;
         }
         Self::new(files, &weights, device)?.fold()

@@ -186,11 +186,15 @@ impl<'a> Node<'a> {
 
 /// Reads a JSON file of at most 16 MiB.
 pub(crate) fn read_json(path: &Path) -> Result<Value> {
-    let bytes = std::fs::read(path).map_err(Error::io(path))?;
+    parse_json(path, &std::fs::read(path).map_err(Error::io(path))?)
+}
+
+/// Parses at most 16 MiB of JSON; `path` is for messages.
+pub(crate) fn parse_json(path: &Path, bytes: &[u8]) -> Result<Value> {
     if bytes.len() > 16 << 20 {
         return Err(Error::format(path, format!("{} bytes", bytes.len()), "a JSON file under 16 MiB"));
     }
-    serde_json::from_slice(&bytes).map_err(|e| Error::format(path, e.to_string(), "valid JSON"))
+    serde_json::from_slice(bytes).map_err(|e| Error::format(path, e.to_string(), "valid JSON"))
 }
 
 impl VlmConfig {
