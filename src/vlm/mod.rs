@@ -3,6 +3,7 @@
 //! Nothing here knows of depth. Tokens are rows of `[tokens, width]` tensors; there is no batch axis and no padding.
 
 pub mod cache;
+pub mod chat;
 pub(crate) mod checkpoint;
 pub mod config;
 pub mod decoder;
