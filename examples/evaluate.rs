@@ -12,9 +12,10 @@ use anyhow::Context;
 use clap::Parser;
 use common::{load, rounded};
 use indicatif::ProgressBar;
+use sdim::benchmarks::{Dataset, FolderDataset, Sample};
 use sdim::depth::metrics::{Errors, mean};
+use sdim::scenes::procedural;
 use sdim::scenes::score::{METHODS, measurements, score};
-use sdim::scenes::{FolderDataset, Sample, procedural};
 use sdim::{CompleteOptions, DepthScale, QueryPlan};
 use serde_json::{Map, Value, json};
 use std::path::PathBuf;
@@ -81,7 +82,8 @@ impl Frames {
             Frames::Folder(f) => f.load(index),
             Frames::Procedural(_) => {
                 let frame = procedural(HELD_OUT + index as u64, 320, 240)?;
-                Ok(Sample { name: format!("scene-{index}"), rgb: frame.rgb, gt: frame.depth, sparse: None })
+                let name = format!("scene-{index}");
+                Ok(Sample { name, rgb: frame.rgb, gt: frame.depth, sparse: None, masks: Vec::new() })
             }
         }
     }

@@ -4,8 +4,9 @@
 
 use clap::Parser;
 use sdim::DepthScale;
+use sdim::benchmarks::{DepthFile, write_frame};
 use sdim::depth::png16;
-use sdim::scenes::{DepthFile, procedural, sample_points, write_frame};
+use sdim::scenes::{procedural, sample_points};
 use std::path::PathBuf;
 
 #[derive(Parser)]

@@ -7,6 +7,8 @@
 #![deny(unsafe_op_in_unsafe_fn)]
 #![warn(clippy::all)]
 
+#[cfg(feature = "benchmarks")]
+pub mod benchmarks;
 pub mod complete;
 pub mod depth;
 pub mod error;
@@ -17,7 +19,7 @@ pub mod kernels;
 pub mod model;
 pub mod query;
 pub mod refine;
-#[cfg(feature = "train")]
+#[cfg(any(feature = "train", feature = "benchmarks"))]
 pub mod scenes;
 #[cfg(feature = "train")]
 pub mod supervise;

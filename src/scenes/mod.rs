@@ -1,15 +1,15 @@
-//! Procedural RGB-D scenes for training, sparse patterns, and folders of RGB-D frames.
+//! Procedural RGB-D scenes for training, and sparse patterns.
 //!
 //! [`procedural`] casts rays into random indoor and outdoor scenes: its depth is exact, its colours are as unlike each
 //! other as a real camera's. [`SparsePattern`] takes the measurements that a sensor would have made.
 
 mod camera;
 mod cast;
-mod folder;
 mod furniture;
 mod light;
 mod patterns;
 mod rooms;
+#[cfg(feature = "benchmarks")]
 pub mod score;
 mod shapes;
 mod space;
@@ -23,7 +23,6 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::error::{Error, Result};
 pub use camera::Intrinsics;
-pub use folder::{DepthFile, FolderDataset, Sample, write_frame};
 pub use patterns::{SparsePattern, sample_points};
 use stage::Stage;
 

@@ -1,7 +1,7 @@
 //! Scores of the model and of classical interpolation on one frame.
 
-use super::folder::Sample;
 use super::patterns::sample_points;
+use crate::benchmarks::Sample;
 use crate::complete::{CompleteOptions, DepthCompleter};
 use crate::depth::metrics::{Errors, errors};
 use crate::depth::{SparseDepth, interpolate};

@@ -3,28 +3,16 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use image::{ImageFormat, RgbImage};
+use image::ImageFormat;
 
-use super::RgbdFrame;
-use crate::depth::{DepthScale, SparseDepth, npy, png16};
+use super::files::{PICTURES, all_taken, depth, list, list_some, picture, take, unpaired};
+use super::{Dataset, Sample, entry};
+use crate::depth::{DepthScale, npy, png16};
 use crate::error::{Error, Result};
-use crate::frame::{image_error, read_rgb};
+use crate::frame::image_error;
+use crate::scenes::RgbdFrame;
 
-const PICTURES: [&str; 3] = ["png", "jpg", "jpeg"];
 const DEPTHS: [&str; 2] = ["png", "npy"];
-
-/// One frame of a folder.
-#[derive(Clone, Debug)]
-pub struct Sample {
-    /// File name without its ending.
-    pub name: String,
-    /// The picture.
-    pub rgb: RgbImage,
-    /// Ground-truth Z-depth, metres, row-major, as many values as `rgb` has pixels; NaN where unknown.
-    pub gt: Vec<f32>,
-    /// Measurements of a real sensor, where the folder has them.
-    pub sparse: Option<SparseDepth>,
-}
 
 #[derive(Clone, Debug)]
 struct Entry {
@@ -45,75 +33,43 @@ impl FolderDataset {
     /// Lists `dir`. `scale` is the unit of its 16-bit PNGs and integer npy files; without one, loading such a file fails.
     ///
     /// Fails with [`Error::Io`] when `rgb` or `gt` cannot be listed, and with [`Error::Format`] naming the file when a
-    /// picture has no ground truth, a ground truth or measurement no picture, or there is no frame at all.
+    /// picture has no ground truth, a ground truth or measurement no picture, or there is no frame at all. Other folders
+    /// (`intrinsics/`) are left alone.
     pub fn open(dir: impl AsRef<Path>, scale: impl Into<Option<DepthScale>>) -> Result<Self> {
         let dir = dir.as_ref();
-        let pictures = list(&dir.join("rgb"), &PICTURES)?;
+        let pictures = list_some(&dir.join("rgb"), &PICTURES)?;
         let mut truths = list(&dir.join("gt"), &DEPTHS)?;
         let sparse_dir = dir.join("sparse");
         let mut measured = if sparse_dir.is_dir() { list(&sparse_dir, &DEPTHS)? } else { Vec::new() };
         let mut entries = Vec::with_capacity(pictures.len());
         for (name, rgb) in pictures {
             let Some(gt) = take(&mut truths, &name) else {
-                return Err(Error::format(
-                    rgb,
-                    "no ground truth for it",
-                    format!("gt/{name}.png or gt/{name}.npy"),
-                ));
+                return Err(unpaired(&rgb, "ground truth", format!("gt/{name}.png or gt/{name}.npy")));
             };
             let sparse = take(&mut measured, &name);
             entries.push(Entry { name, rgb, gt, sparse });
         }
-        if let Some((name, path)) = truths.into_iter().chain(measured).next() {
-            return Err(Error::format(
-                path,
-                "no picture for it",
-                format!("rgb/{name}.png or rgb/{name}.jpg"),
-            ));
-        }
-        if entries.is_empty() {
-            return Err(Error::format(dir.join("rgb"), "no picture", "at least one .png or .jpg"));
-        }
+        truths.append(&mut measured);
+        all_taken(truths, |name| format!("rgb/{name}.png or rgb/{name}.jpg"))?;
         Ok(Self { entries, scale: scale.into() })
     }
+}
 
-    /// Number of frames, at least 1.
-    pub fn len(&self) -> usize {
+impl Dataset for FolderDataset {
+    fn len(&self) -> usize {
         self.entries.len()
     }
 
-    /// Never true: an empty folder cannot be opened.
-    pub fn is_empty(&self) -> bool {
-        self.entries.is_empty()
+    fn name(&self, index: usize) -> String {
+        self.entries.get(index).map(|e| e.name.clone()).unwrap_or_default()
     }
 
-    /// Names of the frames, sorted.
-    pub fn names(&self) -> impl Iterator<Item = &str> + '_ {
-        self.entries.iter().map(|e| e.name.as_str())
-    }
-
-    /// Reads frame `index`.
-    ///
-    /// Fails with [`Error::Argument`] beyond the last frame, and with an error naming the file when one cannot be read or
-    /// differs in size from its picture.
-    pub fn load(&self, index: usize) -> Result<Sample> {
-        let Some(entry) = self.entries.get(index) else {
-            return Err(Error::argument("index", index, format!("below {}", self.entries.len())));
-        };
-        let rgb = read_rgb(&entry.rgb)?;
-        let gt = self.depth(&entry.gt, &rgb)?.as_slice().to_vec();
-        let sparse = entry.sparse.as_ref().map(|path| self.depth(path, &rgb)).transpose()?;
-        Ok(Sample { name: entry.name.clone(), rgb, gt, sparse })
-    }
-
-    fn depth(&self, path: &Path, rgb: &RgbImage) -> Result<SparseDepth> {
-        let map = SparseDepth::read(path, self.scale)?;
-        let (w, h) = (rgb.width() as usize, rgb.height() as usize);
-        if (map.width(), map.height()) != (w, h) {
-            let found = format!("{}x{} pixels", map.width(), map.height());
-            return Err(Error::format(path, found, format!("{w}x{h} as its picture")));
-        }
-        Ok(map)
+    fn load(&self, index: usize) -> Result<Sample> {
+        let entry = entry(&self.entries, index)?;
+        let rgb = picture(&entry.rgb)?;
+        let gt = depth(&entry.gt, self.scale, &rgb)?.as_slice().to_vec();
+        let sparse = entry.sparse.as_ref().map(|path| depth(path, self.scale, &rgb)).transpose()?;
+        Ok(Sample { name: entry.name.clone(), rgb, gt, sparse, masks: Vec::new() })
     }
 }
 
@@ -155,33 +111,6 @@ fn in_units(metres: f32, scale: DepthScale) -> u16 {
     if saturated { 0 } else { stored }
 }
 
-/// Files of a folder with one of the endings: (name without ending, path), sorted. Two files of one name are an error.
-fn list(dir: &Path, endings: &[&str]) -> Result<Vec<(String, PathBuf)>> {
-    let mut files = Vec::new();
-    for entry in fs::read_dir(dir).map_err(Error::io(dir))? {
-        let path = entry.map_err(Error::io(dir))?.path();
-        let ending = path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase);
-        let stem = path.file_stem().and_then(|s| s.to_str());
-        if let (Some(ending), Some(stem)) = (ending, stem)
-            && endings.contains(&ending.as_str())
-            && !stem.starts_with('.')
-        {
-            files.push((stem.to_string(), path.clone()));
-        }
-    }
-    files.sort();
-    if let Some(two) = files.windows(2).find(|two| two[0].0 == two[1].0) {
-        return Err(Error::format(&two[1].1, "a second file of this name", "one file per frame"));
-    }
-    Ok(files)
-}
-
-/// Removes the file of this name from a sorted list.
-fn take(files: &mut Vec<(String, PathBuf)>, name: &str) -> Option<PathBuf> {
-    let at = files.binary_search_by(|(n, _)| n.as_str().cmp(name)).ok()?;
-    Some(files.remove(at).1)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -194,7 +123,7 @@ mod tests {
         write_frame(dir.path(), "b", &a, DepthFile::Npy).unwrap();
         write_frame(dir.path(), "a", &b, DepthFile::Png(DepthScale::millimetres())).unwrap();
         let set = FolderDataset::open(dir.path(), DepthScale::millimetres()).unwrap();
-        assert_eq!(set.names().collect::<Vec<_>>(), ["a", "b"]);
+        assert_eq!([0, 1, 2].map(|i| set.name(i)), ["a", "b", ""]);
         let exact = set.load(1).unwrap();
         assert_eq!(exact.rgb, a.rgb);
         assert!(exact.gt.iter().zip(&a.depth).all(|(x, y)| x == y || (x.is_nan() && y.is_nan())));

@@ -1,0 +1,216 @@
+//! Data sets of the depth-completion benchmarks, read in the layout in which they are published.
+//!
+//! A [`Layout`] names a data set's way of storing frames; [`Layout::open`] lists the frames and gives them as a [`Dataset`],
+//! whatever the format: picture, ground truth, and the sensor's measurements where the data set has any. The rules of each
+//! (resizing, cropping, validity, outliers) stand at its loader with their source; the protocol is Sec. 4.1 of the paper,
+//! which follows Marigold-DC (arXiv 2412.13389).
+//!
+//! Everything is read from the user's own copy; nothing is downloaded. Files are not trusted: sizes that they claim are
+//! checked against what is really there before memory is set aside, and every error names the file.
+
+mod files;
+mod folder;
+
+use std::path::Path;
+use std::str::FromStr;
+
+use image::RgbImage;
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+
+use crate::depth::{DepthScale, SparseDepth};
+use crate::error::{Error, Result};
+use crate::scenes::SparsePattern;
+pub use folder::{DepthFile, FolderDataset, write_frame};
+
+/// Frames with ground truth, in a fixed order. Opening lists files, loading reads them.
+pub trait Dataset: Send + Sync {
+    /// Number of frames, at least 1.
+    fn len(&self) -> usize;
+
+    /// Never true: a data set without frames cannot be opened.
+    fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Name of a frame: unique in the data set, without path separators. Empty beyond the last frame.
+    fn name(&self, index: usize) -> String;
+
+    /// Reads a frame. The same index always gives the same sample.
+    ///
+    /// # Errors
+    /// [`Error::Argument`] beyond the last frame; otherwise an error that names the file which cannot be read, has another
+    /// format or size than it should, or holds no valid depth.
+    fn load(&self, index: usize) -> Result<Sample>;
+}
+
+/// One frame of a data set.
+#[derive(Clone, Debug)]
+pub struct Sample {
+    /// As [`Dataset::name`].
+    pub name: String,
+    /// The picture.
+    pub rgb: RgbImage,
+    /// Ground-truth Z-depth, metres, row-major, as many values as `rgb` has pixels; NaN where unknown.
+    pub gt: Vec<f32>,
+    /// Measurements of a real sensor, where the data set has them, after its outlier rule.
+    pub sparse: Option<SparseDepth>,
+    /// Regions that the data set marks; empty for most.
+    pub masks: Vec<Mask>,
+}
+
+/// A marked region of a frame.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Mask {
+    /// What is marked.
+    pub name: &'static str,
+    /// Row-major, as many values as the frame has pixels; true where the pixel is what the name says.
+    pub pixels: Vec<bool>,
+}
+
+impl Sample {
+    /// The frame's own measurements; without any, `points` pixels of the ground truth drawn in a pattern.
+    ///
+    /// The draw depends on the seed alone (ChaCha8); give each frame its own, as [`frame_seed`] does.
+    ///
+    /// # Errors
+    /// As [`SparsePattern::sample`].
+    pub fn measurements(&self, points: usize, pattern: SparsePattern, seed: u64) -> Result<SparseDepth> {
+        if let Some(sparse) = &self.sparse {
+            return Ok(sparse.clone());
+        }
+        let (width, height) = (self.rgb.width() as usize, self.rgb.height() as usize);
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        pattern.sample(&self.rgb, &self.gt, width, height, points, &mut rng)
+    }
+
+    /// The mask of this name, where the data set has it.
+    pub fn mask(&self, name: &str) -> Option<&[bool]> {
+        self.masks.iter().find(|m| m.name == name).map(|m| m.pixels.as_slice())
+    }
+}
+
+/// The seed of a frame's random choices: the run's seed plus the frame's index, so that a frame gets the same measurements
+/// whichever part of the data set is run.
+pub fn frame_seed(seed: u64, index: usize) -> u64 {
+    seed.wrapping_add(index as u64)
+}
+
+/// The way in which a data set is stored. Parses from its name in lower case.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Layout {
+    /// `folder`: `rgb/`, `gt/` and perhaps `sparse/`, as Marigold-DC's scripts write them; see [`FolderDataset`].
+    Folder,
+}
+
+/// What may be chosen when a data set is opened.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[non_exhaustive]
+pub struct LayoutOptions {
+    /// Unit of the integer files of [`Layout::Folder`]. The other layouts have a unit of their own and refuse another.
+    pub scale: Option<DepthScale>,
+    /// Seed of measurements that a loader draws itself, as [`frame_seed`] uses it.
+    pub seed: u64,
+    /// Nearest and farthest ground truth that counts, metres; what lies outside becomes NaN. `None`: all of it, as
+    /// Marigold-DC scores. Measurements are never touched.
+    pub range: Option<(f32, f32)>,
+}
+
+impl Layout {
+    /// Every layout.
+    pub const ALL: [Layout; 1] = [Layout::Folder];
+
+    /// The name that [`Layout::from_str`] reads.
+    pub fn name(self) -> &'static str {
+        match self {
+            Layout::Folder => "folder",
+        }
+    }
+
+    /// Number of points that the benchmark's protocol draws from the ground truth; `None` where the data set has measurements
+    /// of its own or leaves the number open.
+    pub fn points(self) -> Option<usize> {
+        match self {
+            Layout::Folder => None,
+        }
+    }
+
+    /// Number of test frames of the whole published benchmark, where there is one.
+    pub fn frames(self) -> Option<usize> {
+        match self {
+            Layout::Folder => None,
+        }
+    }
+
+    /// Lists the frames of a data set.
+    ///
+    /// # Errors
+    /// [`Error::Argument`] for an option that the layout does not take and for a range that is empty; otherwise an error that
+    /// names the file or directory which is missing, or has no partner.
+    pub fn open(self, path: impl AsRef<Path>, options: &LayoutOptions) -> Result<Box<dyn Dataset>> {
+        let path = path.as_ref();
+        if let (Some(scale), true) = (options.scale, self != Layout::Folder) {
+            let expected = format!("none: the files of layout {} have a fixed unit", self.name());
+            return Err(Error::argument("depth scale", scale.units(), expected));
+        }
+        let frames: Box<dyn Dataset> = match self {
+            Layout::Folder => Box::new(FolderDataset::open(path, options.scale)?),
+        };
+        match options.range {
+            None => Ok(frames),
+            Some((near, far)) if near < far => Ok(Box::new(Ranged { frames, near, far })),
+            Some((near, far)) => {
+                Err(Error::argument("range", format!("{near} to {far} m"), "the nearer depth first"))
+            }
+        }
+    }
+}
+
+impl FromStr for Layout {
+    type Err = Error;
+
+    fn from_str(text: &str) -> Result<Self> {
+        Self::ALL.into_iter().find(|l| l.name() == text).ok_or_else(|| {
+            Error::argument("layout", format!("{text:?}"), Self::ALL.map(Self::name).join(", "))
+        })
+    }
+}
+
+impl std::fmt::Display for Layout {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+/// A data set whose ground truth counts only between two depths.
+struct Ranged {
+    frames: Box<dyn Dataset>,
+    near: f32,
+    far: f32,
+}
+
+impl Dataset for Ranged {
+    fn len(&self) -> usize {
+        self.frames.len()
+    }
+
+    fn name(&self, index: usize) -> String {
+        self.frames.name(index)
+    }
+
+    fn load(&self, index: usize) -> Result<Sample> {
+        let mut sample = self.frames.load(index)?;
+        for depth in &mut sample.gt {
+            if !(self.near..=self.far).contains(depth) {
+                *depth = f32::NAN;
+            }
+        }
+        Ok(sample)
+    }
+}
+
+/// The entry of a frame, or the error for an index beyond the last.
+fn entry<T>(entries: &[T], index: usize) -> Result<&T> {
+    entries.get(index).ok_or_else(|| Error::argument("index", index, format!("below {}", entries.len())))
+}
