@@ -3,7 +3,7 @@
 use crate::depth::interpolate::Interpolator;
 use crate::depth::{DepthMap, SparseDepth};
 use crate::error::{Error, Result};
-use crate::model::SdimModel;
+use crate::model::{LoadOptions, SdimModel};
 use crate::query::plan::{Asked, lattice, refine_pixels, stride_within};
 use crate::query::prompt::choose_evenly;
 use crate::query::{Hint, Prefix, Query, QueryPlan, Reading, ask};
@@ -150,7 +150,16 @@ impl DepthCompleter {
     /// [`Error::Tensors`] if the device refuses the tensors.
     #[cfg(feature = "tiny")]
     pub fn tiny_on(device: &Device) -> Result<Self> {
-        Ok(Self::new(crate::model::tiny(device)?))
+        Self::tiny_with(&LoadOptions { device: device.clone(), ..LoadOptions::default() })
+    }
+
+    /// As [`DepthCompleter::tiny`], with a form of weights and an adapter.
+    ///
+    /// # Errors
+    /// [`Error::Tensors`] if the device refuses the tensors; what an adapter can have wrong.
+    #[cfg(feature = "tiny")]
+    pub fn tiny_with(options: &LoadOptions) -> Result<Self> {
+        Ok(Self::new(crate::model::tiny(options)?))
     }
 
     /// Loads a checkpoint directory onto a device.
@@ -161,12 +170,12 @@ impl DepthCompleter {
         Ok(Self::new(SdimModel::load(dir.as_ref(), device)?))
     }
 
-    /// Loads a checkpoint directory with an adapter on top.
+    /// Loads a checkpoint directory with a form of weights and an adapter.
     ///
     /// # Errors
-    /// As [`SdimModel::load_adapted`].
-    pub fn load_adapted(dir: impl AsRef<Path>, adapter: impl AsRef<Path>, device: &Device) -> Result<Self> {
-        Ok(Self::new(SdimModel::load_adapted(dir.as_ref(), Some(adapter.as_ref()), device)?))
+    /// As [`SdimModel::load_with`].
+    pub fn load_with(dir: impl AsRef<Path>, options: &LoadOptions) -> Result<Self> {
+        Ok(Self::new(SdimModel::load_with(dir.as_ref(), options)?))
     }
 
     /// Wraps a model.

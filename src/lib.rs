@@ -7,6 +7,7 @@
 #![deny(unsafe_op_in_unsafe_fn)]
 #![warn(clippy::all)]
 
+pub mod adapter;
 #[cfg(feature = "benchmarks")]
 pub mod benchmarks;
 pub mod complete;
@@ -30,4 +31,6 @@ pub use complete::{CancelToken, CompleteOptions, Completion, DepthCompleter, Pre
 pub use depth::{DepthMap, DepthScale, SparseDepth};
 pub use error::{Error, Result};
 pub use frame::read_rgb;
+pub use kernels::WeightFormat;
+pub use model::{LoadOptions, SdimModel};
 pub use query::QueryPlan;

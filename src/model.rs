@@ -1,8 +1,10 @@
 //! A checkpoint of the depth completion model: Qwen2.5-VL, the fusion block, and the way it is asked.
 
+use crate::adapter::{self, SETTINGS};
 use crate::depth::SparseDepth;
 use crate::error::{Error, Result};
 use crate::fusion::{Fusion, Normalise};
+use crate::kernels::WeightFormat;
 use crate::query::prompt::Glimpse;
 use crate::query::{Prefix, PromptWriter, Settings};
 use crate::vlm::QwenVl;
@@ -10,14 +12,15 @@ use crate::vlm::checkpoint::{CONFIG, PREPROCESSOR, Source, TOKENIZER, check_patc
 use crate::vlm::config::VlmConfig;
 use crate::vlm::grid::Grid;
 use crate::vlm::linear::Linear;
+use crate::vlm::lora::LoraMode;
 use crate::vlm::patch_embed::PatchEmbed;
 use crate::vlm::preprocess::{Pixels, PreprocessorConfig};
 use crate::vlm::tokenizer::Tokenizer;
 use crate::vlm::weights::Weights;
-use candle_core::{DType, Device, Tensor};
+use candle_core::{Device, Tensor};
 use image::RgbImage;
 use rayon::prelude::*;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 /// The fusion block with the second patch embedding (F_e2 of Eq. 3a).
@@ -47,9 +50,6 @@ pub struct SdimModel {
     /// Where its tensors are.
     pub device: Device,
 }
-
-/// What is ours about a checkpoint, beside the published files.
-const SETTINGS: &str = "sdim.json";
 
 /// The files of a checkpoint that are not tensors.
 pub struct CheckpointFiles {
@@ -102,20 +102,20 @@ impl CheckpointFiles {
     }
 }
 
-impl SdimModel {
-    /// Builds the model; fails on missing or unread tensors.
-    ///
-    /// # Errors
-    /// [`Error::Config`] if the preprocessor's patches are not the model's; tensor and tokenizer errors.
-    pub fn new(files: CheckpointFiles, weights: &Weights, device: &Device) -> Result<Self> {
-        let CheckpointFiles { config, preprocessor, settings, tokenizer } = files;
-        check_patches(&preprocessor, &config)?;
-        let v = &config.vision;
-        let prompts = PromptWriter::new(&settings, &tokenizer)?;
+/// Everything of a model that has weights.
+pub(crate) struct Parts {
+    pub(crate) vlm: QwenVl,
+    pub(crate) injection: Option<DepthInjection>,
+    pub(crate) glimpse: Option<Linear>,
+}
+
+impl Parts {
+    /// Asks for each tensor; what is missing is for [`Weights::finish`] to tell.
+    pub(crate) fn new(config: VlmConfig, settings: &Settings, weights: &Weights) -> Result<Self> {
         let injection = match &settings.fusion {
             Some(fusion) => Some(DepthInjection {
                 fusion: Fusion::new(fusion, weights)?,
-                patch_embed: PatchEmbed::new(v, weights, "sdim.patch_embed.proj")?,
+                patch_embed: PatchEmbed::new(&config.vision, weights, "sdim.patch_embed.proj")?,
             }),
             None => None,
         };
@@ -125,7 +125,41 @@ impl SdimModel {
             }
             None => None,
         };
-        let vlm = QwenVl::new(config, weights, settings.rope_layout)?;
+        Ok(Self { vlm: QwenVl::new(config, weights, settings.rope_layout)?, injection, glimpse })
+    }
+}
+
+/// How to load a checkpoint.
+#[derive(Debug, Clone)]
+pub struct LoadOptions {
+    /// Where its tensors shall lie.
+    pub device: Device,
+    /// In what form its matrices are kept. On the CPU, [`WeightFormat::Bf16`] takes half the memory of
+    /// [`WeightFormat::F32`] and is faster; a published checkpoint loses nothing by it, since it is stored in bf16.
+    pub weights: WeightFormat,
+    /// A directory with `sdim.json` and `sdim.safetensors`, which replace or complete those of the checkpoint.
+    pub adapter: Option<PathBuf>,
+    /// What becomes of the adapter's LoRA factors.
+    pub lora: LoraMode,
+}
+
+impl Default for LoadOptions {
+    /// The CPU, f32, no adapter.
+    fn default() -> Self {
+        Self { device: Device::Cpu, weights: WeightFormat::F32, adapter: None, lora: LoraMode::default() }
+    }
+}
+
+impl SdimModel {
+    /// Builds the model; fails on missing or unread tensors.
+    ///
+    /// # Errors
+    /// [`Error::Config`] if the preprocessor's patches are not the model's; tensor and tokenizer errors.
+    pub fn new(files: CheckpointFiles, weights: &Weights, device: &Device) -> Result<Self> {
+        let CheckpointFiles { config, preprocessor, settings, tokenizer } = files;
+        check_patches(&preprocessor, &config)?;
+        let prompts = PromptWriter::new(&settings, &tokenizer)?;
+        let Parts { vlm, injection, glimpse } = Parts::new(config, &settings, weights)?;
         weights.finish()?;
         let number_rows = vlm.decoder.head_rows(&prompts.numbers().ids)?;
         Ok(Self {
@@ -151,28 +185,36 @@ impl SdimModel {
         Ok(self)
     }
 
-    /// Loads a checkpoint directory: `config.json`, `preprocessor_config.json`, `tokenizer.json`, `model.safetensors` or its
-    /// shards with their index, and `sdim.json` if it has one.
+    /// Loads a checkpoint directory in f32: `config.json`, `preprocessor_config.json`, `tokenizer.json`,
+    /// `model.safetensors` or its shards with their index, and `sdim.json` and `sdim.safetensors` if it has them.
     ///
     /// # Errors
     /// Typed errors that name the file, key or tensor.
     pub fn load(dir: &Path, device: &Device) -> Result<Self> {
-        Self::load_adapted(dir, None, device)
+        Self::load_with(dir, &LoadOptions { device: device.clone(), ..LoadOptions::default() })
     }
 
-    /// Like [`SdimModel::load`], with an adapter directory whose `sdim.json` and `sdim.safetensors` replace or complete
-    /// those of the base checkpoint.
+    /// As [`SdimModel::load`], with a form of weights and an adapter.
     ///
     /// # Errors
     /// Typed errors that name the file, key or tensor.
-    pub fn load_adapted(dir: &Path, adapter: Option<&Path>, device: &Device) -> Result<Self> {
-        let mut files = CheckpointFiles::from_dir(dir)?;
-        let mut weights = Weights::from_dir(dir, DType::F32, device)?;
-        if let Some(adapter) = adapter {
-            files.settings = Settings::from_file(&adapter.join(SETTINGS))?;
-            weights.add_file(&adapter.join("sdim.safetensors"), DType::F32, device)?;
+    pub fn load_with(dir: &Path, options: &LoadOptions) -> Result<Self> {
+        let files = CheckpointFiles::from_dir(dir)?;
+        let mut weights = Weights::from_dir(dir, &options.device)?;
+        let beside = dir.join(adapter::TENSORS);
+        if options.adapter.is_none() && beside.exists() {
+            weights.add_file(&beside)?;
         }
-        Self::new(files, &weights, device)?.fold()
+        Self::assemble(files, weights, options)
+    }
+
+    fn assemble(mut files: CheckpointFiles, mut weights: Weights, options: &LoadOptions) -> Result<Self> {
+        if let Some(adapter) = &options.adapter {
+            files.settings = Settings::from_file(&adapter.join(SETTINGS))?;
+            weights.add_file(&adapter.join(adapter::TENSORS))?;
+        }
+        let weights = weights.with_format(options.weights).with_lora(files.settings.lora_set(options.lora));
+        Self::new(files, &weights, &options.device)?.fold()
     }
 
     /// Resizes a frame and scatters its measurements: pixels, and `[1, h, w, 1]` in number units with 0 where nothing
@@ -297,9 +339,9 @@ pub fn scatter(sparse: &SparseDepth, width: usize, height: usize, unit: f32) -> 
 /// The checkpoint that ships inside the crate.
 ///
 /// # Errors
-/// [`Error::Tensors`] if the device refuses the tensors.
+/// [`Error::Tensors`] if the device refuses the tensors; what an adapter can have wrong.
 #[cfg(feature = "tiny")]
-pub fn tiny(device: &Device) -> Result<SdimModel> {
+pub fn tiny(options: &LoadOptions) -> Result<SdimModel> {
     let files = CheckpointFiles::from_bytes(
         "sdim-tiny",
         include_bytes!("../assets/sdim-tiny/config.json"),
@@ -308,6 +350,6 @@ pub fn tiny(device: &Device) -> Result<SdimModel> {
         include_bytes!("../assets/sdim-tiny/tokenizer.json"),
     )?;
     let bytes = include_bytes!("../assets/sdim-tiny/model.safetensors");
-    let weights = Weights::from_bytes("sdim-tiny/model.safetensors", bytes, DType::F32, device)?;
-    SdimModel::new(files, &weights, device)?.fold()
+    let weights = Weights::from_bytes("sdim-tiny/model.safetensors", &bytes[..], &options.device)?;
+    SdimModel::assemble(files, weights, options)
 }

@@ -46,7 +46,7 @@ fn load(config: &serde_json::Value, weights: &Weights) -> QwenVl {
 }
 
 fn weights(path: &Path) -> Weights {
-    Weights::from_file(path, DType::F32, &CPU).unwrap()
+    Weights::from_file(path, &CPU).unwrap()
 }
 
 /// Compares every stage of every case of a directory; `Err` lists what differs.
@@ -231,7 +231,7 @@ fn renamed(path: &Path, extra: Option<(&str, Tensor)>) -> Weights {
         .collect();
     out.extend(extra.map(|(name, tensor)| (name.to_string(), tensor)));
     let bytes = safetensors::serialize(&out, None).unwrap();
-    Weights::from_bytes("renamed", &bytes, DType::F32, &CPU).unwrap()
+    Weights::from_bytes("renamed", bytes, &CPU).unwrap()
 }
 
 #[test]

@@ -1,20 +1,27 @@
 //! What the examples share.
 #![allow(dead_code)]
 
-use sdim::DepthCompleter;
 use sdim::system::device;
+use sdim::{DepthCompleter, LoadOptions};
 use std::path::Path;
 
 /// Loads `tiny` or a checkpoint directory, with an adapter if given.
 pub fn load(model: &str, adapter: Option<&Path>, device_name: &str) -> anyhow::Result<DepthCompleter> {
-    let device = device(device_name)?;
-    Ok(match (model, adapter) {
-        ("tiny", None) => DepthCompleter::tiny_on(&device)?,
-        ("tiny", Some(_)) => {
-            anyhow::bail!("--adapter goes with a checkpoint directory, not with --model tiny")
-        }
-        (dir, None) => DepthCompleter::load(dir, &device)?,
-        (dir, Some(adapter)) => DepthCompleter::load_adapted(dir, adapter, &device)?,
+    load_as(
+        model,
+        &LoadOptions {
+            device: device(device_name)?,
+            adapter: adapter.map(Path::to_path_buf),
+            ..LoadOptions::default()
+        },
+    )
+}
+
+/// Loads `tiny` or a checkpoint directory.
+pub fn load_as(model: &str, options: &LoadOptions) -> anyhow::Result<DepthCompleter> {
+    Ok(match model {
+        "tiny" => DepthCompleter::tiny_with(options)?,
+        dir => DepthCompleter::load_with(dir, options)?,
     })
 }
 

@@ -4,6 +4,7 @@ use super::number::{DepthUnit, NumberFormat};
 use super::template::PromptTemplate;
 use crate::error::{Error, Result};
 use crate::fusion::FusionConfig;
+use crate::vlm::lora::{LoraConfig, LoraMode, LoraSet};
 use crate::vlm::rope::RopeLayout;
 
 /// The format version that this crate writes and reads.
@@ -79,6 +80,9 @@ pub struct Settings {
     /// Channels of the fusion block; `null` for a checkpoint without one.
     #[serde(default)]
     pub fusion: Option<FusionConfig>,
+    /// Which linear layers of the base model carry low-rank additions; `null` for none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub lora: Option<LoraConfig>,
 }
 
 fn one() -> f32 {
@@ -100,6 +104,7 @@ impl Settings {
             number: NumberFormat::Digits { decimals: 3, integers: 3 },
             unit: DepthUnit::Metres,
             fusion: None,
+            lora: None,
         }
     }
 
@@ -117,6 +122,7 @@ impl Settings {
             number: NumberFormat::Bins { bins: 1000, range: 1.25 },
             unit: DepthUnit::FrameMax,
             fusion: Some(FusionConfig { branch: 16, high: 32, low: 16 }),
+            lora: None,
         }
     }
 
@@ -139,7 +145,21 @@ impl Settings {
         Self::from_bytes(path, &std::fs::read(path).map_err(Error::io(path))?)
     }
 
-    fn validate(&self, file: &str) -> Result<()> {
+    /// The text of `sdim.json`.
+    ///
+    /// # Errors
+    /// [`Error::Config`] on a value out of range, which could not be read back.
+    pub fn to_json(&self) -> Result<String> {
+        self.validate("sdim.json")?;
+        serde_json::to_string_pretty(self).map_err(|e| Error::format("sdim.json", e.to_string(), "JSON"))
+    }
+
+    /// The low-rank additions with what becomes of them.
+    pub(crate) fn lora_set(&self, mode: LoraMode) -> LoraSet {
+        LoraSet { config: self.lora.clone(), mode }
+    }
+
+    pub(crate) fn validate(&self, file: &str) -> Result<()> {
         if self.format != FORMAT {
             return Err(Error::config(file, "format", self.format.to_string(), FORMAT.to_string()));
         }
@@ -162,6 +182,9 @@ impl Settings {
                 format!("{:?}", self.glimpse),
                 "a side of 1 to 64 pixels",
             ));
+        }
+        if let Some(lora) = &self.lora {
+            lora.validate(file)?;
         }
         self.template.validate(file)?;
         self.number.validate(file)

@@ -102,12 +102,10 @@ impl FreshFiles {
         let text = |what: &str, value: &Value| {
             serde_json::to_string_pretty(value).map_err(|e| Error::format(what, e.to_string(), "JSON"))
         };
-        let settings =
-            serde_json::to_value(settings).map_err(|e| Error::format("sdim.json", e.to_string(), "JSON"))?;
         Ok(Self {
             config: text("config.json", &config)?,
             preprocessor: text("preprocessor_config.json", &preprocessor)?,
-            settings: text("sdim.json", &settings)?,
+            settings: settings.to_json()?,
             tokenizer: byte_tokenizer(numbers).to_string(),
         })
     }
@@ -163,7 +161,8 @@ fn normal(rng: &mut ChaCha8Rng) -> f32 {
 /// Initial values of all tensors of a layout (see [`crate::vlm::weights::Weights::wanted`]).
 ///
 /// Norms are 1, biases 0, projections normal with variance 1 / inputs (those into the residual stream smaller), fusion
-/// convolutions He; the depth branch's and the last fusion convolution are 0 as the paper asks (Eq. 1b, 2b). Number tokens
+/// convolutions He; the depth branch's and the last fusion convolution are 0 as the paper asks (Eq. 1b, 2b), and so is the
+/// second factor of each LoRA. Number tokens
 /// start as sinusoids of their value.
 ///
 /// # Errors
@@ -185,6 +184,7 @@ pub fn initial(
             || name.starts_with("sdim.fusion.depth.conv")
             || name.starts_with("sdim.fusion.out")
             || name.starts_with("sdim.glimpse")
+            || name.contains(".lora_B.")
         {
             0.0
         } else if name.starts_with("sdim.fusion") && shape.len() == 4 {

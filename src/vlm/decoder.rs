@@ -5,6 +5,7 @@
 use super::cache::KvCache;
 use super::config::TextConfig;
 use super::linear::{GatedMlp, Linear, RmsNorm};
+use super::matrix::Matrix;
 use super::rope::{MRope, RopeLayout, RopeTable};
 use super::weights::Weights;
 use crate::error::{Error, Result};
@@ -82,11 +83,11 @@ impl DecoderLayer {
 /// The decoder with its embedding and output head.
 pub struct Decoder {
     config: TextConfig,
-    embed_tokens: Tensor,
+    embed_tokens: Matrix,
     layers: Vec<DecoderLayer>,
     norm: RmsNorm,
     /// `[vocab, hidden]`: `lm_head`, or the embedding itself where the config ties them.
-    head: Tensor,
+    head: Matrix,
     rope: MRope,
 }
 
@@ -97,13 +98,13 @@ impl Decoder {
     /// As [`Weights::get`].
     pub fn new(config: &TextConfig, weights: &Weights, layout: RopeLayout) -> Result<Self> {
         let table = [config.vocab_size, config.hidden_size];
-        let embed_tokens = weights.get("model.embed_tokens.weight", &table)?;
+        let embed_tokens = weights.matrix("model.embed_tokens.weight", table, None)?;
         let head = if config.tie_word_embeddings {
             // Merged or re-saved tied checkpoints can carry a redundant copy.
             weights.ignore("lm_head.weight");
             embed_tokens.clone()
         } else {
-            weights.get("lm_head.weight", &table)?
+            weights.matrix("lm_head.weight", table, None)?
         };
         Ok(Self {
             embed_tokens,
@@ -137,16 +138,7 @@ impl Decoder {
     /// # Errors
     /// [`Error::Argument`] on an id outside the vocabulary.
     pub fn embed(&self, ids: &[u32]) -> Result<Tensor> {
-        self.rows(&self.embed_tokens, ids)
-    }
-
-    fn rows(&self, table: &Tensor, ids: &[u32]) -> Result<Tensor> {
-        if let Some(id) = ids.iter().find(|&&id| id as usize >= self.config.vocab_size) {
-            let expected = format!("below the model's vocabulary of {}", self.config.vocab_size);
-            return Err(Error::argument("token id", id, expected));
-        }
-        let ids = Tensor::from_vec(ids.to_vec(), ids.len(), table.device())?;
-        Ok(table.index_select(&ids, 0)?)
+        self.embed_tokens.rows(ids)
     }
 
     /// The layout of heads with these blocks.
@@ -212,7 +204,7 @@ impl Decoder {
     /// # Errors
     /// [`Error::Argument`] on an id outside the vocabulary.
     pub fn head_rows(&self, ids: &[u32]) -> Result<Tensor> {
-        self.rows(&self.head, ids)
+        self.head.rows(ids)
     }
 
     /// Logits over the entire vocabulary of normed hidden states, `[rows, vocab]`.
@@ -220,6 +212,6 @@ impl Decoder {
     /// # Errors
     /// [`Error::Tensors`] on another width.
     pub fn logits(&self, normed: &Tensor) -> Result<Tensor> {
-        kernels::linear(normed, &self.head, None)
+        self.head.linear(normed, None)
     }
 }

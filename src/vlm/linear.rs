@@ -1,25 +1,34 @@
 //! Linear layers read from a checkpoint.
 
+use super::lora::{Lora, LoraMode};
+use super::matrix::Matrix;
 use super::weights::Weights;
 use crate::error::Result;
 use crate::kernels;
 use candle_core::Tensor;
 
-/// `x W^T + b`, weight `[out, in]`.
+/// `x W^T + b`, weight `[out, in]`, and a low-rank addition where an adapter has one.
 pub struct Linear {
-    weight: Tensor,
+    weight: Matrix,
     bias: Option<Tensor>,
+    lora: Option<Lora>,
 }
 
 impl Linear {
-    /// Reads `{name}.weight` and, if `bias`, `{name}.bias`.
+    /// Reads `{name}.weight`, if `bias`, `{name}.bias`, and the factors of an adapter (see [`Lora::new`]).
     ///
     /// # Errors
     /// As [`Weights::get`].
     pub fn new(weights: &Weights, name: &str, inputs: usize, outputs: usize, bias: bool) -> Result<Self> {
+        let lora = Lora::new(weights, name, inputs, outputs)?;
+        let (added, lora) = match (lora, weights.lora().mode) {
+            (Some(lora), LoraMode::Merge) => (Some(lora.delta()?), None),
+            (lora, _) => (None, lora),
+        };
         Ok(Self {
-            weight: weights.get(&format!("{name}.weight"), &[outputs, inputs])?,
+            weight: weights.matrix(&format!("{name}.weight"), [outputs, inputs], added.as_ref())?,
             bias: if bias { Some(weights.get(&format!("{name}.bias"), &[outputs])?) } else { None },
+            lora,
         })
     }
 
@@ -28,7 +37,11 @@ impl Linear {
     /// # Errors
     /// [`crate::Error::Tensors`] on another width.
     pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
-        kernels::linear(x, &self.weight, self.bias.as_ref())
+        let y = self.weight.linear(x, self.bias.as_ref())?;
+        match &self.lora {
+            Some(lora) => Ok((y + lora.forward(x)?)?),
+            None => Ok(y),
+        }
     }
 }
 

@@ -3,7 +3,7 @@
 use super::config::read_json;
 use super::weights::Weights;
 use crate::error::{Error, Result};
-use candle_core::{DType, Device};
+use candle_core::Device;
 use std::collections::BTreeSet;
 use std::path::{Component, Path};
 
@@ -13,16 +13,16 @@ const INDEX: &str = "model.safetensors.index.json";
 const SINGLE: &str = "model.safetensors";
 
 impl Weights {
-    /// Reads the tensors of a checkpoint directory: `model.safetensors`, or the shards that
+    /// The tensors of a checkpoint directory: `model.safetensors`, or the shards that
     /// `model.safetensors.index.json` names.
     ///
     /// # Errors
     /// As [`Weights::from_file`]; [`Error::Format`] if the index is damaged, leaves the directory, or names a tensor that its
     /// shard lacks.
-    pub fn from_dir(dir: &Path, dtype: DType, device: &Device) -> Result<Self> {
+    pub fn from_dir(dir: &Path, device: &Device) -> Result<Self> {
         let index = dir.join(INDEX);
         if dir.join(SINGLE).exists() || !index.exists() {
-            return Self::from_file(&dir.join(SINGLE), dtype, device);
+            return Self::from_file(&dir.join(SINGLE), device);
         }
         let json = read_json(&index)?;
         let wrong =
@@ -38,9 +38,9 @@ impl Weights {
             }
             shards.insert(file);
         }
-        let mut weights = Self::from_tensors(&index.display().to_string(), Default::default());
+        let mut weights = Self::empty(&index.display().to_string(), device);
         for shard in shards {
-            weights.add_file(&dir.join(shard), dtype, device)?;
+            weights.add_file(&dir.join(shard))?;
         }
         let absent = map.iter().find(|(name, _)| !weights.has(&super::weights::published_name(name)));
         match absent {

@@ -1,41 +1,54 @@
 //! Named tensors of a checkpoint: strict shapes, published or in-memory names, and a record of what was read.
 
+use super::lora::LoraSet;
+use super::matrix::Matrix;
+use super::stored::Stored;
+pub(crate) use super::stored::StoredFile;
 use crate::error::{Error, Result};
+use crate::kernels::WeightFormat;
 use candle_core::{DType, Device, Tensor};
-use half::{bf16, f16};
-use rayon::prelude::*;
 use std::cell::RefCell;
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::path::Path;
 
-/// Values of all missing tensors together for which zeros stand in, at most. Beyond it a config is refused at once: it
-/// may ask for more than there is memory.
+/// Values of all missing tensors together for which zeros are allocated, at most. Beyond it a config is refused at once:
+/// it may ask for more than there is memory. Missing matrices take no memory and do not count.
 const STAND_INS: usize = 1 << 28;
+
+enum Source {
+    /// In memory already: the trainer's variables, tests.
+    Tensor(Tensor),
+    /// In a file, converted when it is asked for.
+    Stored(Stored),
+}
+
+impl Source {
+    fn dims(&self) -> &[usize] {
+        match self {
+            Source::Tensor(t) => t.dims(),
+            Source::Stored(s) => s.shape(),
+        }
+    }
+}
 
 /// The tensors of a checkpoint under their published names.
 ///
-/// Every read checks the shape and is recorded, so that [`Weights::finish`] can tell missing and unread tensors.
+/// Files are mapped, not read: each tensor is converted when the model asks for it, straight into the form in which it
+/// is kept, so that no weight is ever held twice. Every read checks the shape and is recorded, so that
+/// [`Weights::finish`] can tell missing and unread tensors.
 pub struct Weights {
     file: String,
-    tensors: HashMap<String, Tensor>,
-    /// File of each tensor that did not come from `file`.
-    origin: HashMap<String, String>,
+    device: Device,
+    format: WeightFormat,
+    sources: HashMap<String, Source>,
+    lora: LoraSet,
     read: RefCell<BTreeSet<String>>,
     missing: RefCell<BTreeMap<String, Vec<usize>>>,
 }
 
-/// Little-endian floats of a file as f32, in one pass.
-fn widened(bytes: &[u8], stored: DType) -> Vec<f32> {
-    let pairs = || bytes.par_chunks_exact(2).map(|b| [b[0], b[1]]);
-    match stored {
-        DType::BF16 => pairs().map(|b| bf16::from_le_bytes(b).to_f32()).collect(),
-        DType::F16 => pairs().map(|b| f16::from_le_bytes(b).to_f32()).collect(),
-        _ => bytes.par_chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect(),
-    }
-}
-
-/// Maps an in-memory name of `transformers` >= 4.52 to the published one.
+/// Maps an in-memory name of `transformers` >= 4.52, or one below the prefix that PEFT writes, to the published one.
 pub fn published_name(name: &str) -> String {
+    let name = name.strip_prefix("base_model.model.").unwrap_or(name);
     if let Some(rest) = name.strip_prefix("model.visual.") {
         format!("visual.{rest}")
     } else if let Some(rest) = name.strip_prefix("model.language_model.") {
@@ -46,34 +59,47 @@ pub fn published_name(name: &str) -> String {
 }
 
 impl Weights {
-    /// Tensors that are already in memory (the trainer's variables, tests). `file` is for messages.
-    pub fn from_tensors(file: &str, tensors: HashMap<String, Tensor>) -> Self {
+    /// No tensor yet; see [`Weights::add_file`]. `file` is for messages.
+    pub fn empty(file: &str, device: &Device) -> Self {
         Self {
             file: file.to_string(),
-            tensors,
-            origin: HashMap::new(),
+            device: device.clone(),
+            format: WeightFormat::F32,
+            sources: HashMap::new(),
+            lora: LoraSet::default(),
             read: RefCell::default(),
             missing: RefCell::default(),
         }
     }
 
-    /// Reads safetensors bytes and converts each tensor to `dtype` on `device`.
+    /// Tensors that are already in memory (the trainer's variables, tests). `file` is for messages.
+    pub fn from_tensors(file: &str, tensors: HashMap<String, Tensor>) -> Self {
+        let mut weights = Self::empty(file, &Device::Cpu);
+        weights.sources = tensors.into_iter().map(|(name, t)| (name, Source::Tensor(t))).collect();
+        weights
+    }
+
+    /// Safetensors bytes; tensors will lie on `device`.
     ///
     /// # Errors
     /// [`Error::Format`] if the bytes are truncated or no safetensors; [`Error::Tensor`] on an integer tensor.
-    pub fn from_bytes(file: &str, bytes: &[u8], dtype: DType, device: &Device) -> Result<Self> {
-        let mut weights = Self::from_tensors(file, HashMap::new());
-        weights.add_bytes(file, bytes, dtype, device)?;
+    pub fn from_bytes(
+        file: &str,
+        bytes: impl Into<std::borrow::Cow<'static, [u8]>>,
+        device: &Device,
+    ) -> Result<Self> {
+        let mut weights = Self::empty(file, device);
+        weights.add(StoredFile::in_memory(file, bytes.into()))?;
         Ok(weights)
     }
 
-    /// Reads one safetensors file.
+    /// One safetensors file; tensors will lie on `device`.
     ///
     /// # Errors
     /// As [`Weights::from_bytes`], and [`Error::Io`].
-    pub fn from_file(path: &Path, dtype: DType, device: &Device) -> Result<Self> {
-        let mut weights = Self::from_tensors(&path.display().to_string(), HashMap::new());
-        weights.add_file(path, dtype, device)?;
+    pub fn from_file(path: &Path, device: &Device) -> Result<Self> {
+        let mut weights = Self::empty(&path.display().to_string(), device);
+        weights.add_file(path)?;
         Ok(weights)
     }
 
@@ -81,81 +107,112 @@ impl Weights {
     ///
     /// # Errors
     /// As [`Weights::from_file`].
-    pub fn add_file(&mut self, path: &Path, dtype: DType, device: &Device) -> Result<()> {
-        let file = std::fs::File::open(path).map_err(Error::io(path))?;
-        // SAFETY: the map is read-only and lives for this call. That nobody truncates the file meanwhile is the caller's
-        // part, as with any program that maps its weights; a file that is short to begin with is refused below.
-        let bytes = unsafe { memmap2::Mmap::map(&file) }.map_err(Error::io(path))?;
-        self.add_bytes(&path.display().to_string(), &bytes, dtype, device)
+    pub fn add_file(&mut self, path: &Path) -> Result<()> {
+        self.add(StoredFile::open(path)?)
     }
 
-    fn add_bytes(&mut self, from: &str, bytes: &[u8], dtype: DType, device: &Device) -> Result<()> {
-        let bad = |e: safetensors::SafeTensorError| {
-            Error::format(from, e.to_string(), "a complete safetensors file")
-        };
-        let file = safetensors::SafeTensors::deserialize(bytes).map_err(bad)?;
-        for (name, view) in file.tensors() {
-            let stored = match view.dtype() {
-                safetensors::Dtype::F32 => DType::F32,
-                safetensors::Dtype::F16 => DType::F16,
-                safetensors::Dtype::BF16 => DType::BF16,
-                other => {
-                    return Err(Error::Tensor {
-                        file: from.to_string(),
-                        name,
-                        found: format!("{other:?}"),
-                        expected: "F32, F16 or BF16".into(),
-                    });
-                }
-            };
-            let tensor = if dtype == DType::F32 {
-                Tensor::from_vec(widened(view.data(), stored), view.shape(), device)?
-            } else {
-                Tensor::from_raw_buffer(view.data(), stored, view.shape(), device)?.to_dtype(dtype)?
-            };
-            let name = published_name(&name);
-            if from != self.file {
-                self.origin.insert(name.clone(), from.to_string());
-            }
-            self.tensors.insert(name, tensor);
+    fn add(&mut self, file: StoredFile) -> Result<()> {
+        for (name, stored) in file.tensors()? {
+            self.sources.insert(published_name(&name), Source::Stored(stored));
         }
         Ok(())
     }
 
-    /// Whether a tensor of this name is there.
-    pub fn has(&self, name: &str) -> bool {
-        self.tensors.contains_key(name)
+    /// Adds tensors that are already in memory, which replace those of the same name.
+    pub fn add_tensors(&mut self, tensors: HashMap<String, Tensor>) {
+        self.sources.extend(tensors.into_iter().map(|(name, t)| (published_name(&name), Source::Tensor(t))));
     }
 
-    /// The tensor of this name, which must have this shape.
+    /// In what form matrices are kept; [`WeightFormat::F32`] unless told. Vectors, convolutions and LoRA factors are
+    /// always f32.
+    pub fn with_format(mut self, format: WeightFormat) -> Self {
+        self.format = format;
+        self
+    }
+
+    /// Says which linear layers carry LoRA factors, and whether they are merged into the weight.
+    pub fn with_lora(mut self, lora: LoraSet) -> Self {
+        self.lora = lora;
+        self
+    }
+
+    /// Which linear layers carry LoRA factors.
+    pub fn lora(&self) -> &LoraSet {
+        &self.lora
+    }
+
+    /// Whether a tensor of this name is there.
+    pub fn has(&self, name: &str) -> bool {
+        self.sources.contains_key(name)
+    }
+
+    fn find(&self, name: &str, shape: &[usize]) -> Result<Option<&Source>> {
+        let Some(source) = self.sources.get(name) else { return Ok(None) };
+        if source.dims() != shape {
+            let file = match source {
+                Source::Stored(s) => s.file(),
+                Source::Tensor(_) => &self.file,
+            };
+            return Err(Error::Tensor {
+                file: file.to_string(),
+                name: name.to_string(),
+                found: format!("shape {:?}", source.dims()),
+                expected: format!("shape {shape:?}"),
+            });
+        }
+        self.read.borrow_mut().insert(name.to_string());
+        Ok(Some(source))
+    }
+
+    /// The tensor of this name, which must have this shape, as f32.
     ///
     /// A missing tensor is recorded and stands in as zeros, so that [`Weights::finish`] can list all of them at once.
     ///
     /// # Errors
     /// [`Error::Tensor`] on another shape; [`Error::TensorSet`] at once if the missing tensors hold over 2^28 values.
     pub fn get(&self, name: &str, shape: &[usize]) -> Result<Tensor> {
-        let Some(tensor) = self.tensors.get(name) else {
-            self.miss(name, shape)?;
-            return Ok(Tensor::zeros(shape, DType::F32, &Device::Cpu)?);
-        };
-        if tensor.dims() != shape {
-            return Err(Error::Tensor {
-                file: self.origin.get(name).unwrap_or(&self.file).clone(),
-                name: name.to_string(),
-                found: format!("shape {:?}", tensor.dims()),
-                expected: format!("shape {shape:?}"),
-            });
+        match self.find(name, shape)? {
+            Some(Source::Tensor(t)) => Ok(t.to_dtype(DType::F32)?),
+            Some(Source::Stored(s)) => s.f32(&self.device),
+            None => {
+                self.miss(name, shape, true)?;
+                Ok(Tensor::zeros(shape, DType::F32, &Device::Cpu)?)
+            }
         }
-        self.read.borrow_mut().insert(name.to_string());
-        Ok(tensor.clone())
     }
 
-    fn miss(&self, name: &str, shape: &[usize]) -> Result<()> {
+    /// The matrix `[rows, columns]` of this name in the form of [`Weights::with_format`], with `added` (f32, same shape)
+    /// on top if given.
+    ///
+    /// # Errors
+    /// As [`Weights::get`]; a missing matrix is recorded and takes no memory.
+    pub fn matrix(&self, name: &str, shape: [usize; 2], added: Option<&Tensor>) -> Result<Matrix> {
+        match self.find(name, &shape)? {
+            Some(Source::Tensor(t)) => Matrix::from_tensor(&t.to_dtype(DType::F32)?, added, self.format),
+            Some(Source::Stored(s)) => match added {
+                Some(_) => Matrix::from_tensor(&s.f32(&self.device)?, added, self.format),
+                None => Matrix::from_stored(s, self.format, &self.device),
+            },
+            None => {
+                self.miss(name, &shape, false)?;
+                let zero = Tensor::zeros((1, 1), DType::F32, &Device::Cpu)?;
+                Ok(Matrix::Plain(zero.broadcast_as(&shape)?))
+            }
+        }
+    }
+
+    fn miss(&self, name: &str, shape: &[usize], allocated: bool) -> Result<()> {
         let mut missing = self.missing.borrow_mut();
         missing.insert(name.to_string(), shape.to_vec());
         let values = |s: &[usize]| s.iter().try_fold(1usize, |n, &d| n.checked_mul(d));
-        let total = missing.values().try_fold(0usize, |n, s| n.checked_add(values(s)?));
-        if total.is_some_and(|n| n <= STAND_INS) {
+        let enough = if allocated {
+            let others = missing.iter().filter(|(n, s)| s.len() != 2 || *n == name);
+            let total = others.map(|(_, s)| values(s)).try_fold(0usize, |n, v| n.checked_add(v?));
+            total.is_some_and(|n| n <= STAND_INS)
+        } else {
+            values(shape).is_some()
+        };
+        if enough {
             return Ok(());
         }
         let missing = missing.keys().cloned().collect();
@@ -180,7 +237,7 @@ impl Weights {
         let read = self.read.borrow();
         let missing: Vec<String> = self.missing.borrow().keys().cloned().collect();
         let mut unexpected: Vec<String> =
-            self.tensors.keys().filter(|k| !read.contains(*k)).cloned().collect();
+            self.sources.keys().filter(|k| !read.contains(*k)).cloned().collect();
         unexpected.sort();
         if missing.is_empty() && unexpected.is_empty() {
             return Ok(());

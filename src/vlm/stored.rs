@@ -1,0 +1,143 @@
+//! Tensors as they lie in safetensors files: found at once, mapped and converted one at a time.
+
+use crate::error::{Error, Result};
+use candle_core::{DType, Device, Tensor};
+use half::{bf16, f16};
+use rayon::prelude::*;
+use std::borrow::Cow;
+use std::fs::File;
+use std::ops::Range;
+use std::path::Path;
+use std::sync::Arc;
+
+enum Content {
+    Bytes(Cow<'static, [u8]>),
+    Mapped(File),
+}
+
+struct Inner {
+    name: String,
+    content: Content,
+}
+
+/// A safetensors file, in memory or on disk.
+pub(crate) struct StoredFile(Arc<Inner>);
+
+/// One floating-point tensor of a file.
+pub(crate) struct Stored {
+    file: Arc<Inner>,
+    dtype: DType,
+    shape: Vec<usize>,
+    range: Range<usize>,
+}
+
+/// Maps a range of a file for the time of one call. Only what is mapped counts as the program's memory, so a checkpoint
+/// is never resident beside the weights that are made from it.
+fn mapped<R>(name: &str, file: &File, range: Option<Range<usize>>, f: impl FnOnce(&[u8]) -> R) -> Result<R> {
+    let mut options = memmap2::MmapOptions::new();
+    if let Some(range) = range {
+        if range.is_empty() {
+            return Ok(f(&[]));
+        }
+        options.offset(range.start as u64).len(range.len());
+    }
+    // SAFETY: the map is read-only and lives for this call. That nobody truncates the file meanwhile is the caller's
+    // part, as with any program that maps its weights; a file that is short to begin with is refused when it is opened.
+    let bytes = unsafe { options.map(file) }.map_err(Error::io(Path::new(name)))?;
+    Ok(f(&bytes))
+}
+
+impl StoredFile {
+    pub(super) fn in_memory(name: &str, bytes: Cow<'static, [u8]>) -> Self {
+        Self(Arc::new(Inner { name: name.to_string(), content: Content::Bytes(bytes) }))
+    }
+
+    pub(crate) fn open(path: &Path) -> Result<Self> {
+        let file = File::open(path).map_err(Error::io(path))?;
+        Ok(Self(Arc::new(Inner { name: path.display().to_string(), content: Content::Mapped(file) })))
+    }
+
+    /// Names and places of all tensors.
+    pub(crate) fn tensors(&self) -> Result<Vec<(String, Stored)>> {
+        match &self.0.content {
+            Content::Bytes(bytes) => self.parse(bytes),
+            Content::Mapped(file) => mapped(&self.0.name, file, None, |bytes| self.parse(bytes))?,
+        }
+    }
+
+    fn parse(&self, bytes: &[u8]) -> Result<Vec<(String, Stored)>> {
+        let name = &self.0.name;
+        let file = safetensors::SafeTensors::deserialize(bytes)
+            .map_err(|e| Error::format(name, e.to_string(), "a complete safetensors file"))?;
+        let mut tensors = Vec::new();
+        for (tensor, view) in file.tensors() {
+            let dtype = match view.dtype() {
+                safetensors::Dtype::F32 => DType::F32,
+                safetensors::Dtype::F16 => DType::F16,
+                safetensors::Dtype::BF16 => DType::BF16,
+                other => {
+                    return Err(Error::Tensor {
+                        file: name.clone(),
+                        name: tensor,
+                        found: format!("{other:?}"),
+                        expected: "F32, F16 or BF16".into(),
+                    });
+                }
+            };
+            let start = view.data().as_ptr() as usize - bytes.as_ptr() as usize;
+            let range = start..start + view.data().len();
+            let shape = view.shape().to_vec();
+            tensors.push((tensor, Stored { file: self.0.clone(), dtype, shape, range }));
+        }
+        Ok(tensors)
+    }
+}
+
+impl Stored {
+    pub(super) fn shape(&self) -> &[usize] {
+        &self.shape
+    }
+
+    /// Name of the file, for messages.
+    pub(super) fn file(&self) -> &str {
+        &self.file.name
+    }
+
+    pub(super) fn dtype(&self) -> DType {
+        self.dtype
+    }
+
+    /// Calls `f` with the little-endian bytes.
+    pub(super) fn with_bytes<R>(&self, f: impl FnOnce(&[u8]) -> R) -> Result<R> {
+        match &self.file.content {
+            Content::Bytes(bytes) => Ok(f(&bytes[self.range.clone()])),
+            Content::Mapped(file) => mapped(&self.file.name, file, Some(self.range.clone()), f),
+        }
+    }
+
+    /// The values as f32, in one pass.
+    pub(super) fn values(&self) -> Result<Vec<f32>> {
+        self.with_bytes(|bytes| widened(bytes, self.dtype))
+    }
+
+    /// The tensor on the CPU in the type in which it is stored.
+    pub(crate) fn tensor(&self) -> Result<Tensor> {
+        let tensor = |bytes: &[u8]| Tensor::from_raw_buffer(bytes, self.dtype, self.shape(), &Device::Cpu);
+        Ok(self.with_bytes(tensor)??)
+    }
+
+    /// The tensor as f32 on a device.
+    pub(super) fn f32(&self, device: &Device) -> Result<Tensor> {
+        Ok(Tensor::from_vec(self.values()?, self.shape(), device)?)
+    }
+}
+
+/// Little-endian floats as f32.
+fn widened(bytes: &[u8], stored: DType) -> Vec<f32> {
+    let pairs = || bytes.par_chunks_exact(2).map(|b| [b[0], b[1]]);
+    match stored {
+        DType::BF16 => pairs().map(|b| bf16::from_le_bytes(b).to_f32()).collect(),
+        DType::F16 => pairs().map(|b| f16::from_le_bytes(b).to_f32()).collect(),
+        _ => bytes.par_chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect(),
+    }
+}

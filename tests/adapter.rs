@@ -1,0 +1,191 @@
+//! Adapters on a base checkpoint: neutral when fresh, equal bit for bit after a round trip, merged or apart.
+
+mod common;
+
+use candle_core::{Device, Tensor};
+use common::tiny;
+use sdim::adapter::Adapter;
+use sdim::fusion::FusionConfig;
+use sdim::model::{LoadOptions, SdimModel};
+use sdim::query::{PixelReference, Settings};
+use sdim::supervise::init::FreshFiles;
+use sdim::vlm::lora::{LoraConfig, LoraMode};
+use sdim::{CompleteOptions, DepthCompleter, Error, QueryPlan, WeightFormat};
+use std::path::Path;
+
+/// The way of asking of a base without fusion block.
+fn plain() -> Settings {
+    Settings { fusion: None, glimpse: None, ..Settings::tiny() }
+}
+
+fn adapted() -> Settings {
+    Settings {
+        fusion: Some(FusionConfig { branch: 4, high: 6, low: 5 }),
+        lora: Some(LoraConfig {
+            rank: 3,
+            alpha: 6.0,
+            targets: ["q_proj", "down_proj", "qkv"].map(String::from).to_vec(),
+        }),
+        ..plain()
+    }
+}
+
+struct Base {
+    dir: tempfile::TempDir,
+    files: FreshFiles,
+}
+
+impl Base {
+    fn new() -> Self {
+        let files = tiny::small_files(&plain());
+        let dir = tempfile::tempdir().unwrap();
+        tiny::write(dir.path(), &files, &tiny::tensors(&files, 11));
+        Self { dir, files }
+    }
+
+    fn fresh(&self) -> Adapter {
+        Adapter::fresh(&self.files.parse().unwrap().config, adapted(), 5).unwrap()
+    }
+
+    fn load(&self, adapter: Option<&Path>, lora: LoraMode, weights: WeightFormat) -> SdimModel {
+        let adapter = adapter.map(Path::to_path_buf);
+        let options = LoadOptions { adapter, lora, weights, ..LoadOptions::default() };
+        SdimModel::load_with(self.dir.path(), &options).unwrap()
+    }
+}
+
+fn answers(model: SdimModel) -> Vec<f32> {
+    let (rgb, sparse) = tiny::frame(80, 64);
+    let options = CompleteOptions { plan: QueryPlan::Every, ..CompleteOptions::default() };
+    let map = DepthCompleter::new(model).complete(&rgb, &sparse, &options).unwrap();
+    map.depth().iter().chain(map.expected_error()).copied().collect()
+}
+
+fn bits(values: &[f32]) -> Vec<u32> {
+    values.iter().map(|v| v.to_bits()).collect()
+}
+
+/// Every tensor that a fresh adapter leaves at zero becomes a small random one.
+fn disturb(adapter: &mut Adapter) {
+    for (name, tensor) in &mut adapter.tensors {
+        let zero = tensor.abs().unwrap().sum_all().unwrap().to_scalar::<f32>().unwrap() == 0.0;
+        if zero && !name.ends_with("running_mean") {
+            let count = tensor.elem_count();
+            let values: Vec<f32> = (0..count).map(|i| ((i * 37 % 101) as f32 - 50.0) * 4e-3).collect();
+            *tensor = Tensor::from_vec(values, tensor.shape(), &Device::Cpu).unwrap();
+        }
+    }
+}
+
+#[test]
+fn a_fresh_adapter_changes_nothing() {
+    let base = Base::new();
+    let dir = tempfile::tempdir().unwrap();
+    base.fresh().save(dir.path()).unwrap();
+    for weights in [WeightFormat::F32, WeightFormat::Bf16] {
+        let alone = bits(&answers(base.load(None, LoraMode::Merge, weights)));
+        for lora in [LoraMode::Merge, LoraMode::Apart] {
+            let adapted = bits(&answers(base.load(Some(dir.path()), lora, weights)));
+            assert!(alone == adapted, "{weights:?}, {lora:?}");
+        }
+    }
+}
+
+#[test]
+fn a_trained_adapter_changes_the_answers_and_merging_does_not() {
+    let base = Base::new();
+    let mut adapter = base.fresh();
+    disturb(&mut adapter);
+    let dir = tempfile::tempdir().unwrap();
+    adapter.save(dir.path()).unwrap();
+    let alone = answers(base.load(None, LoraMode::Merge, WeightFormat::F32));
+    let merged = answers(base.load(Some(dir.path()), LoraMode::Merge, WeightFormat::F32));
+    let apart = answers(base.load(Some(dir.path()), LoraMode::Apart, WeightFormat::F32));
+    let max = alone.iter().fold(0f32, |m, v| m.max(v.abs()));
+    let gap = |a: &[f32], b: &[f32]| a.iter().zip(b).fold(0f32, |m, (a, b)| m.max((a - b).abs()));
+    assert!(gap(&alone, &merged) > 1e-2 * max, "the adapter had no effect");
+    assert!(gap(&merged, &apart) < 1e-4 * max, "{} of {max}", gap(&merged, &apart));
+}
+
+#[test]
+fn each_part_of_an_adapter_has_its_effect() {
+    let base = Base::new();
+    let mut adapter = base.fresh();
+    disturb(&mut adapter);
+    let alone = answers(base.load(None, LoraMode::Merge, WeightFormat::F32));
+    for part in ["sdim.fusion", "q_proj.lora", "down_proj.lora", "qkv.lora"] {
+        let mut only = base.fresh();
+        for (name, tensor) in &mut only.tensors {
+            if name.contains(part) {
+                *tensor = adapter.tensors[name].clone();
+            }
+        }
+        let dir = tempfile::tempdir().unwrap();
+        only.save(dir.path()).unwrap();
+        let with = answers(base.load(Some(dir.path()), LoraMode::Merge, WeightFormat::F32));
+        assert!(bits(&with) != bits(&alone), "{part}");
+    }
+}
+
+#[test]
+fn saving_and_loading_keeps_every_bit() {
+    let base = Base::new();
+    let mut adapter = base.fresh();
+    disturb(&mut adapter);
+    adapter.settings.pixel_reference = PixelReference::Coordinates;
+    adapter.settings.position_scale = 0.1 + 0.2;
+    let half = "sdim.patch_embed.proj.weight";
+    let narrow = adapter.tensors[half].to_dtype(candle_core::DType::BF16).unwrap();
+    adapter.tensors.insert(half.into(), narrow);
+    let dir = tempfile::tempdir().unwrap();
+    let (first, second) = (dir.path().join("a"), dir.path().join("b"));
+    adapter.save(&first).unwrap();
+    let again = Adapter::load(&first).unwrap();
+    assert_eq!(again.settings, adapter.settings);
+    again.save(&second).unwrap();
+    for file in ["sdim.json", "sdim.safetensors"] {
+        let [a, b] = [&first, &second].map(|d| std::fs::read(d.join(file)).unwrap());
+        assert!(a == b, "{file}");
+    }
+    for (name, tensor) in &adapter.tensors {
+        let read = &again.tensors[name];
+        assert_eq!((read.dtype(), read.dims()), (tensor.dtype(), tensor.dims()), "{name}");
+    }
+}
+
+#[test]
+fn what_an_adapter_has_wrong_is_named() {
+    let base = Base::new();
+    let config = base.files.parse().unwrap().config;
+    let mut settings = adapted();
+    settings.lora.as_mut().unwrap().targets.push("z_proj".into());
+    let error = Adapter::fresh(&config, settings, 0).unwrap_err();
+    assert!(error.to_string().contains("z_proj"), "{error}");
+
+    let adapter = base.fresh();
+    let fails = |change: &dyn Fn(&mut Adapter)| {
+        let mut bad = adapter.clone();
+        change(&mut bad);
+        let dir = tempfile::tempdir().unwrap();
+        bad.save(dir.path()).unwrap();
+        let adapter = Some(dir.path().to_path_buf());
+        SdimModel::load_with(base.dir.path(), &LoadOptions { adapter, ..LoadOptions::default() })
+            .err()
+            .expect("an error")
+    };
+    let a = "model.layers.1.self_attn.q_proj.lora_A.weight";
+    match fails(&|bad| drop(bad.tensors.remove(a))) {
+        Error::TensorSet { missing, .. } => assert_eq!(missing, [a]),
+        other => panic!("{other:?}"),
+    }
+    match fails(&|bad| bad.settings.lora.as_mut().unwrap().rank = 4) {
+        Error::Tensor { file, expected, .. } => {
+            assert!(file.ends_with("sdim.safetensors") && expected.contains('4'), "{file}, {expected}")
+        }
+        other => panic!("{other:?}"),
+    }
+    match fails(&|bad| bad.settings.lora = None) {
+        Error::TensorSet { unexpected, .. } => assert!(unexpected.contains(&a.to_string())),
+        other => panic!("{other:?}"),
+    }
+}
