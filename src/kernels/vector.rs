@@ -13,6 +13,8 @@ pub(super) trait Vector: Copy {
     unsafe fn store(self, to: *mut f32);
     /// `self * b + c`.
     unsafe fn madd(self, b: Self, c: Self) -> Self;
+    /// The lower and the upper halves of `LANES` words as f32: what bf16 pairs are widened by.
+    unsafe fn halves(from: *const u32) -> [Self; 2];
 }
 
 #[cfg(target_arch = "x86_64")]
@@ -21,7 +23,7 @@ mod x86 {
     use std::arch::x86_64::*;
 
     macro_rules! vector {
-        ($type:ty, $lanes:literal, $splat:ident, $load:ident, $store:ident, |$a:ident, $b:ident, $c:ident| $madd:expr) => {
+        ($type:ty, $lanes:literal, $splat:ident, $load:ident, $store:ident, |$a:ident, $b:ident, $c:ident| $madd:expr, |$from:ident| $halves:expr) => {
             impl Vector for $type {
                 const LANES: usize = $lanes;
                 #[inline(always)]
@@ -45,18 +47,53 @@ mod x86 {
                     // SAFETY: the caller has the instruction set.
                     unsafe { $madd }
                 }
+                #[inline(always)]
+                unsafe fn halves($from: *const u32) -> [Self; 2] {
+                    // SAFETY: the caller has the instruction set and a good pointer.
+                    unsafe { $halves }
+                }
             }
         };
     }
-    vector!(__m512, 16, _mm512_set1_ps, _mm512_loadu_ps, _mm512_storeu_ps, |a, b, c| {
-        _mm512_fmadd_ps(a, b, c)
-    });
-    vector!(__m256, 8, _mm256_set1_ps, _mm256_loadu_ps, _mm256_storeu_ps, |a, b, c| {
-        _mm256_fmadd_ps(a, b, c)
-    });
-    vector!(__m128, 4, _mm_set1_ps, _mm_loadu_ps, _mm_storeu_ps, |a, b, c| {
-        _mm_add_ps(_mm_mul_ps(a, b), c)
-    });
+    vector!(
+        __m512,
+        16,
+        _mm512_set1_ps,
+        _mm512_loadu_ps,
+        _mm512_storeu_ps,
+        |a, b, c| _mm512_fmadd_ps(a, b, c),
+        |from| {
+            let words = _mm512_loadu_si512(from.cast());
+            let upper = _mm512_and_si512(words, _mm512_set1_epi32(-0x1_0000));
+            [_mm512_castsi512_ps(_mm512_slli_epi32(words, 16)), _mm512_castsi512_ps(upper)]
+        }
+    );
+    vector!(
+        __m256,
+        8,
+        _mm256_set1_ps,
+        _mm256_loadu_ps,
+        _mm256_storeu_ps,
+        |a, b, c| _mm256_fmadd_ps(a, b, c),
+        |from| {
+            let words = _mm256_loadu_si256(from.cast());
+            let upper = _mm256_and_si256(words, _mm256_set1_epi32(-0x1_0000));
+            [_mm256_castsi256_ps(_mm256_slli_epi32(words, 16)), _mm256_castsi256_ps(upper)]
+        }
+    );
+    vector!(
+        __m128,
+        4,
+        _mm_set1_ps,
+        _mm_loadu_ps,
+        _mm_storeu_ps,
+        |a, b, c| _mm_add_ps(_mm_mul_ps(a, b), c),
+        |from| {
+            let words = _mm_loadu_si128(from.cast());
+            let upper = _mm_and_si128(words, _mm_set1_epi32(-0x1_0000));
+            [_mm_castsi128_ps(_mm_slli_epi32(words, 16)), _mm_castsi128_ps(upper)]
+        }
+    );
 }
 
 /// The register that every machine of this architecture has.
@@ -89,5 +126,11 @@ impl Vector for Four {
     #[inline(always)]
     unsafe fn madd(self, b: Self, c: Self) -> Self {
         Four(std::array::from_fn(|i| super::math::madd::<4>(self.0[i], b.0[i], c.0[i])))
+    }
+    #[inline(always)]
+    unsafe fn halves(from: *const u32) -> [Self; 2] {
+        // SAFETY: the caller's pointer is good for four words.
+        let words = unsafe { from.cast::<[u32; 4]>().read_unaligned() };
+        [Four(words.map(|w| f32::from_bits(w << 16))), Four(words.map(|w| f32::from_bits(w & 0xffff_0000)))]
     }
 }

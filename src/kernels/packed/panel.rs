@@ -1,0 +1,98 @@
+//! Weights as panels of 32 output channels.
+
+use rayon::prelude::*;
+
+/// Output channels of a panel.
+pub(super) const WIDTH: usize = 32;
+/// Words transposed together: the part of 32 rows that stays in the first-level cache.
+const PIECE: usize = 128;
+
+/// Words whose first is at the start of a cache line, so that no register-wide load crosses one.
+#[derive(Debug)]
+pub(super) struct Words {
+    data: Vec<u32>,
+    start: usize,
+    len: usize,
+}
+
+impl Words {
+    /// Zeros.
+    pub(super) fn zeros(len: usize) -> Self {
+        let data = vec![0u32; len + 15];
+        // The distance is 15 at most where the address is a multiple of 4, as it is for u32.
+        let start = data.as_ptr().align_offset(64).min(15);
+        Words { data, start, len }
+    }
+
+    pub(super) fn get(&self) -> &[u32] {
+        &self.data[self.start..self.start + self.len]
+    }
+
+    pub(super) fn get_mut(&mut self) -> &mut [u32] {
+        &mut self.data[self.start..self.start + self.len]
+    }
+}
+
+/// A weight `[m, k]` as `[panel][step][channel]`; channels and values that do not exist are zeros.
+#[derive(Debug)]
+pub(super) struct Panels {
+    words: Words,
+    pub(super) m: usize,
+    pub(super) k: usize,
+    /// Steps through the inner dimension.
+    pub(super) steps: usize,
+}
+
+impl Panels {
+    /// Packs rows that `fill(row, words)` writes, `per_step` values to a word.
+    pub(super) fn build(
+        m: usize,
+        k: usize,
+        per_step: usize,
+        fill: impl Fn(usize, &mut [u32]) + Sync,
+    ) -> Self {
+        let steps = k.div_ceil(per_step);
+        let mut words = Words::zeros(m.div_ceil(WIDTH) * WIDTH * steps);
+        let pack = |rows: &mut Vec<u32>, (p, panel): (usize, &mut [u32])| {
+            let first = p * WIDTH;
+            let count = WIDTH.min(m - first);
+            rows.resize(WIDTH * steps, 0);
+            for (r, row) in rows.chunks_exact_mut(steps).take(count).enumerate() {
+                fill(first + r, row);
+            }
+            transpose(panel, rows, steps, count);
+        };
+        if steps > 0 {
+            words.get_mut().par_chunks_exact_mut(WIDTH * steps).enumerate().for_each_init(Vec::new, pack);
+        }
+        Panels { words, m, k, steps }
+    }
+
+    /// All panels.
+    pub(super) fn words(&self) -> &[u32] {
+        self.words.get()
+    }
+
+    /// Memory held, in bytes.
+    pub(super) fn bytes(&self) -> usize {
+        self.words.data.len() * size_of::<u32>()
+    }
+
+    /// The words of one row, which must be below `m`.
+    pub(super) fn row(&self, row: usize) -> impl Iterator<Item = u32> + '_ {
+        let panel = row / WIDTH * WIDTH * self.steps;
+        let words = &self.words()[panel..panel + WIDTH * self.steps];
+        words.chunks_exact(WIDTH).map(move |step| step[row % WIDTH])
+    }
+}
+
+/// `count` rows of `steps` words to `steps` rows of [`WIDTH`].
+fn transpose(panel: &mut [u32], rows: &[u32], steps: usize, count: usize) {
+    for (piece, panel) in panel.chunks_mut(PIECE * WIDTH).enumerate() {
+        for (c, row) in rows.chunks_exact(steps).take(count).enumerate() {
+            for (step, word) in panel.chunks_exact_mut(WIDTH).zip(&row[piece * PIECE..]) {
+                step[c] = *word;
+            }
+        }
+    }
+}
