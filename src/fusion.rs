@@ -64,7 +64,7 @@ struct ConvBnAct {
     beta: Tensor,
     mean: Tensor,
     var: Tensor,
-    /// Convolution with the running statistics folded in.
+    /// Scale and shift that stand for the running statistics, once they no longer change.
     folded: Option<(Tensor, Tensor)>,
 }
 
@@ -92,9 +92,7 @@ impl ConvBnAct {
     }
 
     fn fold(&mut self) -> Result<()> {
-        let (scale, shift) = self.affine()?;
-        let kernel = self.conv.broadcast_mul(&scale.reshape(((), 1, 1, 1))?)?;
-        self.folded = Some((kernel, shift));
+        self.folded = Some(self.affine()?);
         Ok(())
     }
 
@@ -108,17 +106,14 @@ impl ConvBnAct {
                 stats.push(BatchStats { name: format!("{}.bn", self.name), mean, var });
                 Ok(y)
             }
-            Normalise::Running => match &self.folded {
-                Some((kernel, shift)) => {
-                    let y = kernels::conv3x3(x, kernel, Some(shift))?;
-                    Ok(y.maximum(&(&y * LEAKY_SLOPE)?)?)
-                }
-                None => {
-                    let (scale, shift) = self.affine()?;
-                    let y = kernels::conv3x3(x, &self.conv, None)?;
-                    kernels::affine_act(&y, &scale, &shift, LEAKY_SLOPE)
-                }
-            },
+            Normalise::Running => {
+                let (scale, shift) = match &self.folded {
+                    Some(folded) => folded.clone(),
+                    None => self.affine()?,
+                };
+                let y = kernels::conv3x3(x, &self.conv, None)?;
+                kernels::affine_act(&y, &scale, &shift, LEAKY_SLOPE)
+            }
         }
     }
 }
@@ -152,7 +147,7 @@ impl Fusion {
         })
     }
 
-    /// Folds the running statistics into the convolutions, for inference.
+    /// Turns the running statistics into one scale and shift per channel, for inference.
     ///
     /// # Errors
     /// [`crate::Error::Tensors`] if a tensor operation fails.

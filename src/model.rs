@@ -4,12 +4,13 @@ use crate::adapter::{self, SETTINGS};
 use crate::depth::SparseDepth;
 use crate::error::{Error, Result};
 use crate::fusion::{Fusion, Normalise};
-use crate::kernels::WeightFormat;
+use crate::kernels::{self, WeightFormat};
 use crate::query::prompt::Glimpse;
 use crate::query::{Prefix, PromptWriter, Settings};
 use crate::vlm::QwenVl;
 use crate::vlm::checkpoint::{CONFIG, PREPROCESSOR, Source, TOKENIZER, check_patches};
 use crate::vlm::config::VlmConfig;
+use crate::vlm::decoder::Keep;
 use crate::vlm::grid::Grid;
 use crate::vlm::linear::Linear;
 use crate::vlm::lora::LoraMode;
@@ -262,7 +263,7 @@ impl SdimModel {
             let o = injection.fusion.forward(&rgb, scattered, normalise)?;
             let tokens = grids.iter().enumerate();
             let tokens = tokens.map(|(i, &grid)| injection.patch_embed.forward_image(&o.get(i)?, grid));
-            embedded = (embedded + Tensor::cat(&tokens.collect::<Result<Vec<_>>>()?, 0)?)?; // Eq. 3a
+            embedded = kernels::add(&embedded, &Tensor::cat(&tokens.collect::<Result<Vec<_>>>()?, 0)?)?; // Eq. 3a
         }
         self.vlm.vision.encode(&embedded, &grids)
     }
@@ -283,7 +284,7 @@ impl SdimModel {
         let embedded = self.vlm.embed_prompt(&tokens.ids, image_tokens)?;
         let embedded = self.add_glimpses(embedded, &[(&image, &tokens.glimpses)])?;
         let mut cache = self.vlm.decoder.cache(1);
-        self.vlm.prefill(&embedded, &tokens.positions, &mut cache)?;
+        self.vlm.prefill(&embedded, &tokens.positions, &mut cache, Keep::Nothing)?;
         Ok(Prefix { cache, space, image })
     }
 }
@@ -311,7 +312,7 @@ impl SdimModel {
         });
         let added = layer.forward(&Tensor::from_vec(crops, (count, len), &self.device)?)?;
         if all.iter().enumerate().all(|(i, (_, g))| g.token == i) && count == embedded.dim(0)? {
-            return Ok((embedded + added)?);
+            return kernels::add(&embedded, &added);
         }
         let rows: Vec<u32> = all.iter().map(|(_, g)| g.token as u32).collect();
         Ok(embedded.index_add(&Tensor::from_vec(rows, count, &self.device)?, &added, 0)?)

@@ -8,7 +8,7 @@ use candle_core::{DType, Device, Tensor};
 use common::Golden;
 use sdim::vlm::QwenVl;
 use sdim::vlm::config::VlmConfig;
-use sdim::vlm::decoder::Context;
+use sdim::vlm::decoder::{Context, Keep};
 use sdim::vlm::generate::GenerateOptions;
 use sdim::vlm::grid::{Grid, WindowOrder};
 use sdim::vlm::preprocess::{Pixels, PreprocessorConfig};
@@ -193,13 +193,15 @@ impl Case<'_> {
     fn steps(&self, embedded: &Tensor, walked: &PromptPositions) {
         let (model, decoder) = (self.model, &self.model.decoder);
         let mut cache = decoder.cache(1);
-        let mut hidden = model.prefill(embedded, &walked.positions, &mut cache).unwrap();
+        let mut hidden = model.prefill(embedded, &walked.positions, &mut cache, Keep::All).unwrap();
         let mut rows = Vec::new();
         for (step, id) in self.golden.integers(&self.key("generated_ids")).into_iter().enumerate() {
             let last = hidden.narrow(0, hidden.dim(0).unwrap() - 1, 1).unwrap();
             rows.push(decoder.logits(&decoder.final_norm(&last).unwrap()).unwrap());
             let position = Position::text(walked.next + step as f32);
-            hidden = model.prefill(&decoder.embed(&[id as u32]).unwrap(), &[position], &mut cache).unwrap();
+            hidden = model
+                .prefill(&decoder.embed(&[id as u32]).unwrap(), &[position], &mut cache, Keep::All)
+                .unwrap();
         }
         self.close("step_logits", &Tensor::cat(&rows, 0).unwrap());
     }

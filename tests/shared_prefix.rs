@@ -11,7 +11,7 @@ use sdim::model::SdimModel;
 use sdim::query::number::{DepthUnit, DigitReader, NumberFormat, Reading, read_bins};
 use sdim::query::prompt::Tokens;
 use sdim::query::{Hint, MeasurementPrompt, PixelReference, Prefix, Query, Settings, ask};
-use sdim::vlm::decoder::Context;
+use sdim::vlm::decoder::{Context, Keep};
 use sdim::vlm::rope::{Position, RopeLayout};
 
 /// Largest difference, relative to the largest value.
@@ -89,7 +89,7 @@ impl Setup {
         let own = self.embed(std::slice::from_ref(suffix));
         let positions: Vec<Position> = self.positions.iter().chain(&suffix.positions).copied().collect();
         let embedded = Tensor::cat(&[&self.embedded, &own], 0).unwrap();
-        let hidden = self.model.vlm.prefill(&embedded, &positions, &mut decoder.cache(1)).unwrap();
+        let hidden = self.model.vlm.prefill(&embedded, &positions, &mut decoder.cache(1), Keep::All).unwrap();
         hidden.narrow(0, self.positions.len(), suffix.len()).unwrap()
     }
 

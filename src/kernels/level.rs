@@ -88,20 +88,20 @@ fn choose(asked: Option<&str>) -> Level {
 /// Defines `fn $name(level, args..)` that runs `$body::<LANES>(args..)` compiled for that level, with
 /// `LANES` f32 to a register: 4, 8 or 16. The body must be `#[inline(always)]` and contain no closure that another thread runs.
 macro_rules! per_level {
-    ($(#[$meta:meta])* fn $name:ident $(<$(const $c:ident : usize),+>)? ($($arg:ident : $ty:ty),* $(,)?) = $body:ident) => {
+    ($(#[$meta:meta])* fn $name:ident $(<$(const $c:ident : usize),+>)? ($($arg:ident : $ty:ty),* $(,)?) $(-> $out:ty)? = $body:ident) => {
         $(#[$meta])*
         #[allow(clippy::too_many_arguments)]
-        pub(in crate::kernels) fn $name $(<$(const $c: usize),+>)? (level: $crate::kernels::level::Level, $($arg: $ty),*) {
+        pub(in crate::kernels) fn $name $(<$(const $c: usize),+>)? (level: $crate::kernels::level::Level, $($arg: $ty),*) $(-> $out)? {
             #[cfg(target_arch = "x86_64")]
             {
                 #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw,avx2,fma")]
                 #[allow(clippy::too_many_arguments)]
-                fn avx512 $(<$(const $c: usize),+>)? ($($arg: $ty),*) {
+                fn avx512 $(<$(const $c: usize),+>)? ($($arg: $ty),*) $(-> $out)? {
                     $body::<16 $($(, $c)+)?>($($arg),*)
                 }
                 #[target_feature(enable = "avx2,fma")]
                 #[allow(clippy::too_many_arguments)]
-                fn avx2 $(<$(const $c: usize),+>)? ($($arg: $ty),*) {
+                fn avx2 $(<$(const $c: usize),+>)? ($($arg: $ty),*) $(-> $out)? {
                     $body::<8 $($(, $c)+)?>($($arg),*)
                 }
                 if level.is_avx512() {

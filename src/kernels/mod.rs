@@ -12,6 +12,7 @@
 
 mod activation;
 mod adamw;
+mod add;
 mod attention;
 mod attention_composed;
 mod attention_cpu;
@@ -20,6 +21,7 @@ mod attention_rows;
 #[cfg(test)]
 mod attention_tests;
 mod attention_tile;
+mod bins;
 mod conv;
 mod exec;
 mod level;
@@ -38,7 +40,9 @@ mod vector;
 
 pub use activation::{gelu_erf, swiglu};
 pub use adamw::adamw_step;
+pub use add::add;
 pub use attention::{AttentionLayout, Block, attention};
+pub use bins::{BinStats, bin_stats};
 pub use conv::conv3x3;
 pub use linear::linear;
 pub use memory::keep_freed_memory;

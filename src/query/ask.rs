@@ -1,12 +1,12 @@
 //! Batches of per-pixel suffixes against one shared prefix.
 
-use super::number::{DigitReader, NumberFormat, Reading, read_bins};
+use super::number::{DigitReader, NumberFormat, Reading, read_bins_with};
 use super::prompt::{FrameSpace, Glimpse, Query, Tokens};
 use crate::error::Result;
 use crate::kernels;
 use crate::model::SdimModel;
 use crate::vlm::cache::KvCache;
-use crate::vlm::decoder::Context;
+use crate::vlm::decoder::{Context, Keep};
 use crate::vlm::rope::Position;
 use candle_core::Tensor;
 use image::RgbImage;
@@ -108,7 +108,8 @@ fn ask_batch(
     match model.prompts.numbers().format {
         NumberFormat::Bins { range, bins } => {
             let rows: Vec<f32> = logits.flatten_all()?.to_vec1()?;
-            Ok(rows.par_chunks(bins).map(|row| read_bins(row, range)).collect())
+            let rows = rows.par_chunks(bins);
+            Ok(rows.map_init(Vec::new, |scratch, row| read_bins_with(row, range, scratch)).collect())
         }
         NumberFormat::Digits { decimals, integers } => {
             let mut readers = vec![DigitReader::new(decimals, integers); batch.len()];
@@ -154,15 +155,7 @@ fn number_logits(
     let decoder = &model.vlm.decoder;
     let embedded = model.add_glimpses(decoder.embed(ids)?, &[(&prefix.image, glimpses)])?;
     let table = decoder.rope().table(positions, embedded.device())?;
-    let items = own.items();
     let context = Context::Cached { shared: Some(&prefix.cache), own };
-    let hidden = decoder.forward(&embedded, &table, context, None)?;
-    let length = ids.len() / items;
-    let last = if length == 1 {
-        hidden
-    } else {
-        let rows: Vec<u32> = (0..items).map(|i| (i * length + length - 1) as u32).collect();
-        hidden.index_select(&Tensor::from_vec(rows, items, hidden.device())?, 0)?
-    };
+    let last = decoder.forward_keeping(&embedded, &table, context, Keep::Last)?;
     kernels::linear(&decoder.final_norm(&last)?, &model.number_rows, None)
 }

@@ -1,6 +1,7 @@
 //! Numbers as tokens: how a depth is written into a prompt, and how an answer is read from logits.
 
 use crate::error::{Error, Result};
+use crate::kernels::bin_stats;
 use crate::vlm::tokenizer::Tokenizer;
 
 /// What the number 1 means in prompts and answers.
@@ -134,34 +135,19 @@ pub fn bin_token(bin: usize) -> String {
     format!("<|d{bin}|>")
 }
 
-/// Reads one distribution over bins.
+/// Reads one distribution over bins that cover 0 to `range`.
 pub fn read_bins(logits: &[f32], range: f64) -> Reading {
-    let bins = logits.len();
-    let width = (range / bins as f64) as f32;
-    let max = logits.iter().copied().fold(f32::NEG_INFINITY, f32::max);
-    if !max.is_finite() || logits.iter().any(|l| l.is_nan()) {
-        return Reading::INVALID;
-    }
-    let weights: Vec<f32> = logits.iter().map(|l| (l - max).exp()).collect();
-    let total: f32 = weights.iter().sum();
-    let mut below = 0.0;
-    let mut value = range as f32;
-    for (k, w) in weights.iter().enumerate() {
-        if below + w >= total * 0.5 {
-            value = (k as f32 + (total * 0.5 - below) / w) * width;
-            break;
-        }
-        below += w;
-    }
-    let (mut error, mut near) = (0.0, 0.0);
+    read_bins_with(logits, range, &mut Vec::new())
+}
+
+/// As [`read_bins`], with a buffer to use again.
+pub fn read_bins_with(logits: &[f32], range: f64, scratch: &mut Vec<f32>) -> Reading {
+    let width = (range / logits.len() as f64) as f32;
     // At least one bin's width, or a sharp answer of a near pixel could never be confident.
-    let tolerance = (value * CONFIDENT_WITHIN).max(width);
-    for (k, w) in weights.iter().enumerate() {
-        let distance = ((k as f32 + 0.5) * width - value).abs();
-        error += w * distance;
-        near += if distance <= tolerance { *w } else { 0.0 };
+    match bin_stats(logits, scratch, |median| (median * CONFIDENT_WITHIN).max(1.0)) {
+        Some(s) => Reading { value: s.median * width, confidence: s.near, expected_error: s.spread * width },
+        None => Reading::INVALID,
     }
-    Reading { value, confidence: (near / total).clamp(0.0, 1.0), expected_error: error / total }
 }
 
 /// Reads a number from its digits' distributions as they were chosen one after the other.

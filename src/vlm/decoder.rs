@@ -54,30 +54,55 @@ impl DecoderLayer {
         })
     }
 
-    /// `[tokens, hidden]` to the same.
+    /// `[tokens, hidden]` to the same, or to the rows of `kept`.
     fn forward(
         &self,
         x: &Tensor,
         table: &RopeTable,
         layout: &AttentionLayout,
+        kept: Option<&Kept>,
         index: usize,
         context: &mut Context,
     ) -> Result<Tensor> {
         let normed = self.input_layernorm.forward(x)?;
-        let q = kernels::rope(&self.q_proj.forward(&normed)?, &table.cos, &table.sin, layout.heads)?;
         let k = kernels::rope(&self.k_proj.forward(&normed)?, &table.cos, &table.sin, layout.kv_heads)?;
         let v = self.v_proj.forward(&normed)?;
-        let mixed = match context {
-            Context::Packed(_) => kernels::attention(&q, &k, &v, None, layout)?,
+        let (k, v, shared) = match context {
+            Context::Packed(_) => (k, v, None),
             Context::Cached { shared, own } => {
                 let (k, v) = own.append(index, &k, &v)?;
-                let shared = shared.and_then(|s| s.layer(index));
-                kernels::attention(&q, &k, &v, shared, layout)?
+                (k, v, shared.and_then(|s| s.layer(index)))
             }
         };
-        let x = (x + self.o_proj.forward(&mixed)?)?;
-        Ok((&x + self.mlp.forward(&self.post_attention_layernorm.forward(&x)?)?)?)
+        let (x, normed, table, layout) = match kept {
+            None => (x.clone(), normed, table, layout),
+            Some(Kept::None) => return Ok(x.narrow(0, 0, 0)?),
+            Some(Kept::Rows { rows, table, layout }) => {
+                (x.index_select(rows, 0)?, normed.index_select(rows, 0)?, table, layout)
+            }
+        };
+        let q = kernels::rope(&self.q_proj.forward(&normed)?, &table.cos, &table.sin, layout.heads)?;
+        let mixed = kernels::attention(&q, &k, &v, shared, layout)?;
+        let x = kernels::add(&x, &self.o_proj.forward(&mixed)?)?;
+        kernels::add(&x, &self.mlp.forward(&self.post_attention_layernorm.forward(&x)?)?)
     }
+}
+
+/// Of which tokens the last layer's output is wanted; keys and values are made of all.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Keep {
+    /// Every token.
+    All,
+    /// The last token of each item of the cache: what the next token is read from.
+    Last,
+    /// No token: the pass only fills the cache.
+    Nothing,
+}
+
+/// [`Keep`] in the terms of one pass.
+enum Kept {
+    None,
+    Rows { rows: Tensor, table: RopeTable, layout: AttentionLayout },
 }
 
 /// The decoder with its embedding and output head.
@@ -155,31 +180,51 @@ impl Decoder {
         &self,
         embedded: &Tensor,
         table: &RopeTable,
+        context: Context,
+        trace: Option<&mut Vec<Tensor>>,
+    ) -> Result<Tensor> {
+        self.run(embedded, table, context, Keep::All, trace)
+    }
+
+    /// As [`Decoder::forward`] without a trace; gives the rows that `keep` names and saves the others' work in the last
+    /// layer.
+    ///
+    /// # Errors
+    /// As [`Decoder::forward`]; [`Error::Argument`] if rows are to be left out without a cache.
+    pub fn forward_keeping(
+        &self,
+        embedded: &Tensor,
+        table: &RopeTable,
+        context: Context,
+        keep: Keep,
+    ) -> Result<Tensor> {
+        self.run(embedded, table, context, keep, None)
+    }
+
+    fn run(
+        &self,
+        embedded: &Tensor,
+        table: &RopeTable,
         mut context: Context,
+        keep: Keep,
         mut trace: Option<&mut Vec<Tensor>>,
     ) -> Result<Tensor> {
         let rows = embedded.dim(0)?;
         let layout = match &context {
             Context::Packed(layout) => (*layout).clone(),
-            Context::Cached { shared, own } => {
-                let items = own.items();
-                if items == 0 || rows % items != 0 {
-                    return Err(Error::argument("rows", rows, format!("a multiple of {items} cache items")));
-                }
-                let q_period = rows / items;
-                self.layout(vec![Block {
-                    queries: 0..rows,
-                    shared: 0..shared.map_or(0, KvCache::len),
-                    own_start: 0,
-                    q_period,
-                    k_period: own.len() + q_period,
-                    causal: true,
-                }])
+            Context::Cached { shared, own } => self.cached_layout(rows, *shared, own)?,
+        };
+        let kept = match &context {
+            Context::Packed(_) if keep == Keep::All => None,
+            Context::Packed(_) => {
+                return Err(Error::argument("keep", format!("{keep:?}"), "all rows of packed sequences"));
             }
+            Context::Cached { own, .. } => self.kept(keep, table, &layout, own.items(), rows)?,
         };
         let mut x = embedded.clone();
         for (i, layer) in self.layers.iter().enumerate() {
-            x = layer.forward(&x, table, &layout, i, &mut context)?;
+            let kept = kept.as_ref().filter(|_| i + 1 == self.layers.len());
+            x = layer.forward(&x, table, &layout, kept, i, &mut context)?;
             if let Some(t) = trace.as_deref_mut() {
                 t.push(x.clone());
             }
@@ -189,6 +234,48 @@ impl Decoder {
             own.advance(rows / items);
         }
         Ok(x)
+    }
+
+    fn cached_layout(&self, rows: usize, shared: Option<&KvCache>, own: &KvCache) -> Result<AttentionLayout> {
+        let items = own.items();
+        if !rows.is_multiple_of(items) {
+            return Err(Error::argument("rows", rows, format!("a multiple of {items} cache items")));
+        }
+        let q_period = rows / items;
+        Ok(self.layout(vec![Block {
+            queries: 0..rows,
+            shared: 0..shared.map_or(0, KvCache::len),
+            own_start: 0,
+            q_period,
+            k_period: own.len() + q_period,
+            causal: true,
+        }]))
+    }
+
+    fn kept(
+        &self,
+        keep: Keep,
+        table: &RopeTable,
+        layout: &AttentionLayout,
+        items: usize,
+        rows: usize,
+    ) -> Result<Option<Kept>> {
+        match keep {
+            Keep::All => return Ok(None),
+            Keep::Last if rows == items => return Ok(None),
+            Keep::Last => {}
+            Keep::Nothing => return Ok(Some(Kept::None)),
+        }
+        let length = (rows / items) as u32;
+        let last: Vec<u32> = (1..=items as u32).map(|i| i * length - 1).collect();
+        let last = Tensor::from_vec(last, items, table.cos.device())?;
+        let table =
+            RopeTable { cos: table.cos.index_select(&last, 0)?, sin: table.sin.index_select(&last, 0)? };
+        let mut layout = layout.clone();
+        for block in &mut layout.blocks {
+            (block.queries, block.q_period) = (0..items, 1);
+        }
+        Ok(Some(Kept::Rows { rows: last, table, layout }))
     }
 
     /// The final norm.

@@ -1,6 +1,7 @@
 //! Free generation, token by token.
 
 use super::QwenVl;
+use super::decoder::Keep;
 use super::rope::Position;
 use crate::error::Result;
 use candle_core::{DType, Tensor};
@@ -38,11 +39,10 @@ impl QwenVl {
         let mut cache = self.decoder.cache(1);
         let mut sampler = LogitsProcessor::from_sampling(0, Sampling::ArgMax);
         let mut seen = ids.to_vec();
-        let mut hidden = self.prefill(embedded, positions, &mut cache)?;
+        let mut hidden = self.prefill(embedded, positions, &mut cache, Keep::Last)?;
         let mut answer = Vec::new();
         while answer.len() < options.max_new_tokens {
-            let last = hidden.narrow(0, hidden.dim(0)? - 1, 1)?;
-            let logits = self.decoder.logits(&self.decoder.final_norm(&last)?)?.squeeze(0)?;
+            let logits = self.decoder.logits(&self.decoder.final_norm(&hidden)?)?.squeeze(0)?;
             let usable = options.usable_vocab.min(logits.dim(0)?);
             let logits = logits.narrow(0, 0, usable)?.to_dtype(DType::F32)?;
             let logits = if options.repetition_penalty == 1.0 {
@@ -60,7 +60,7 @@ impl QwenVl {
                 break;
             }
             seen.push(id);
-            hidden = self.prefill(&self.decoder.embed(&[id])?, &[position], &mut cache)?;
+            hidden = self.prefill(&self.decoder.embed(&[id])?, &[position], &mut cache, Keep::Last)?;
         }
         Ok(answer)
     }

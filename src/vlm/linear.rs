@@ -39,7 +39,7 @@ impl Linear {
     pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
         let y = self.weight.linear(x, self.bias.as_ref())?;
         match &self.lora {
-            Some(lora) => Ok((y + lora.forward(x)?)?),
+            Some(lora) => kernels::add(&y, &lora.forward(x)?),
             None => Ok(y),
         }
     }

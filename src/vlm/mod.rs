@@ -27,7 +27,7 @@ use crate::error::Result;
 use cache::KvCache;
 use candle_core::Tensor;
 use config::VlmConfig;
-use decoder::{Context, Decoder};
+use decoder::{Context, Decoder, Keep};
 use grid::Grid;
 use rope::{Position, RopeLayout};
 use vision::VisionTower;
@@ -91,12 +91,20 @@ impl QwenVl {
         Ok(Tensor::cat(&parts, 0)?)
     }
 
-    /// Reads tokens into a cache and returns their hidden states before the final norm, `[tokens, hidden]`.
+    /// Reads tokens into a cache and returns the hidden states before the final norm of those that `keep` names,
+    /// `[kept, hidden]`.
     ///
     /// # Errors
     /// [`crate::Error::Tensors`] on mismatched shapes.
-    pub fn prefill(&self, embedded: &Tensor, positions: &[Position], cache: &mut KvCache) -> Result<Tensor> {
+    pub fn prefill(
+        &self,
+        embedded: &Tensor,
+        positions: &[Position],
+        cache: &mut KvCache,
+        keep: Keep,
+    ) -> Result<Tensor> {
         let table = self.decoder.rope().table(positions, embedded.device())?;
-        self.decoder.forward(embedded, &table, Context::Cached { shared: None, own: cache }, None)
+        let context = Context::Cached { shared: None, own: cache };
+        self.decoder.forward_keeping(embedded, &table, context, keep)
     }
 }

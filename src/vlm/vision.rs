@@ -44,8 +44,8 @@ impl VisionBlock {
         let q = kernels::rope(&part(0)?, &table.cos, &table.sin, layout.heads)?;
         let k = kernels::rope(&part(1)?, &table.cos, &table.sin, layout.heads)?;
         let mixed = kernels::attention(&q, &k, &part(2)?, None, layout)?;
-        let x = (x + self.proj.forward(&mixed)?)?;
-        Ok((&x + self.mlp.forward(&self.norm2.forward(&x)?)?)?)
+        let x = kernels::add(x, &self.proj.forward(&mixed)?)?;
+        kernels::add(&x, &self.mlp.forward(&self.norm2.forward(&x)?)?)
     }
 }
 
