@@ -2,6 +2,7 @@
 //!
 //! Nothing here knows of depth. Tokens are rows of `[tokens, width]` tensors; there is no batch axis and no padding.
 
+mod answer;
 pub mod cache;
 pub mod chat;
 pub(crate) mod checkpoint;
@@ -17,11 +18,13 @@ pub mod preprocess;
 pub mod prompt;
 pub mod resize;
 pub mod rope;
-mod shards;
+pub(crate) mod shards;
 mod stored;
 pub mod tokenizer;
 pub mod vision;
 pub mod weights;
+
+pub use answer::{Answer, AnswerOptions, ChatModel};
 
 use crate::error::Result;
 use cache::KvCache;

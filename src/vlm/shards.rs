@@ -4,13 +4,36 @@ use super::config::read_json;
 use super::weights::Weights;
 use crate::error::{Error, Result};
 use candle_core::Device;
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Component, Path};
 
 /// Index of a sharded checkpoint.
-const INDEX: &str = "model.safetensors.index.json";
+pub(crate) const INDEX: &str = "model.safetensors.index.json";
 /// A checkpoint in one file.
-const SINGLE: &str = "model.safetensors";
+pub(crate) const SINGLE: &str = "model.safetensors";
+
+/// Files of the tensors that an index names; all of them files of its folder.
+fn weight_map(index: &Path) -> Result<BTreeMap<String, String>> {
+    let json = read_json(index)?;
+    let wrong =
+        |found: &str| Error::format(index, found, "`weight_map`: tensor names to files of this folder");
+    let map = json.get("weight_map").and_then(|m| m.as_object()).ok_or_else(|| wrong("no `weight_map`"))?;
+    let file_of = |(tensor, file): (&String, &serde_json::Value)| {
+        let file = file.as_str().ok_or_else(|| wrong(tensor))?;
+        let mut parts = Path::new(file).components();
+        match (parts.next(), parts.next()) {
+            (Some(Component::Normal(_)), None) => Ok((tensor.clone(), file.to_string())),
+            _ => Err(wrong(file)),
+        }
+    };
+    map.iter().map(file_of).collect()
+}
+
+/// The shards that an index names.
+#[cfg(feature = "hub")]
+pub(crate) fn shard_names(index: &Path) -> Result<BTreeSet<String>> {
+    Ok(weight_map(index)?.into_values().collect())
+}
 
 impl Weights {
     /// The tensors of a checkpoint directory: `model.safetensors`, or the shards that
@@ -24,20 +47,8 @@ impl Weights {
         if dir.join(SINGLE).exists() || !index.exists() {
             return Self::from_file(&dir.join(SINGLE), device);
         }
-        let json = read_json(&index)?;
-        let wrong =
-            |found: &str| Error::format(&index, found, "`weight_map`: tensor names to files of this folder");
-        let map =
-            json.get("weight_map").and_then(|m| m.as_object()).ok_or_else(|| wrong("no `weight_map`"))?;
-        let mut shards = BTreeSet::new();
-        for (tensor, file) in map {
-            let file = file.as_str().ok_or_else(|| wrong(tensor))?;
-            let mut parts = Path::new(file).components();
-            if !matches!((parts.next(), parts.next()), (Some(Component::Normal(_)), None)) {
-                return Err(wrong(file));
-            }
-            shards.insert(file);
-        }
+        let map = weight_map(&index)?;
+        let shards: BTreeSet<&String> = map.values().collect();
         let mut weights = Self::empty(&index.display().to_string(), device);
         for shard in shards {
             weights.add_file(&dir.join(shard))?;

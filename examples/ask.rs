@@ -1,0 +1,87 @@
+//! Asks a plain Qwen2.5-VL checkpoint about an image: the first thing to run to see that a checkpoint works.
+//!
+//! `cargo run --release --example ask -- --model DIR --image P --prompt TEXT`. With the feature `hub`, `--model` may also
+//! be a repository such as `Qwen/Qwen2.5-VL-3B-Instruct`.
+
+use clap::Parser;
+use sdim::kernels::WeightFormat;
+use sdim::read_rgb;
+use sdim::system::device;
+use sdim::vlm::{AnswerOptions, ChatModel};
+use serde_json::json;
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+#[derive(Parser)]
+struct Args {
+    /// Checkpoint directory.
+    #[arg(long)]
+    model: String,
+    /// PNG or JPEG.
+    #[arg(long)]
+    image: PathBuf,
+    /// The question.
+    #[arg(long)]
+    prompt: String,
+    /// Tokens of the answer at most.
+    #[arg(long, default_value_t = AnswerOptions::default().max_new_tokens)]
+    max_new_tokens: usize,
+    /// 1 is off; without it, as the checkpoint's generation_config.json says.
+    #[arg(long)]
+    repetition_penalty: Option<f32>,
+    /// Form in which the matrices are kept: f32, or bf16 for half the memory.
+    #[arg(long, default_value = "f32", value_parser = ["f32", "bf16"])]
+    dtype: String,
+    /// cpu, cuda:N or metal.
+    #[arg(long, default_value = "cpu")]
+    device: String,
+    /// One JSON object on stdout instead of the answer.
+    #[arg(long)]
+    json: bool,
+}
+
+/// The directory of this name, or else the local copy of the repository.
+fn checkpoint(model: &str) -> sdim::Result<PathBuf> {
+    let dir = PathBuf::from(model);
+    #[cfg(feature = "hub")]
+    if !dir.exists() && sdim::hub::is_repository(model) {
+        return sdim::hub::checkpoint(model, None);
+    }
+    Ok(dir)
+}
+
+fn run(args: &Args) -> sdim::Result<String> {
+    sdim::kernels::keep_freed_memory();
+    let image = read_rgb(&args.image)?;
+    let weights = if args.dtype == "bf16" { WeightFormat::Bf16 } else { WeightFormat::F32 };
+    let model = ChatModel::load_as(checkpoint(&args.model)?, &device(&args.device)?, weights)?;
+    let options = AnswerOptions {
+        max_new_tokens: args.max_new_tokens,
+        repetition_penalty: args.repetition_penalty,
+        ..Default::default()
+    };
+    let answer = model.answer(&image, &args.prompt, &options)?;
+    if !args.json {
+        return Ok(answer.text);
+    }
+    let object = json!({
+        "prompt_ids": answer.prompt_ids,
+        "generated_ids": answer.generated_ids,
+        "text": answer.text,
+        "first_logits_top": answer.first_logits_top,
+    });
+    Ok(object.to_string())
+}
+
+fn main() -> ExitCode {
+    match run(&Args::parse()) {
+        Ok(line) => {
+            println!("{line}");
+            ExitCode::SUCCESS
+        }
+        Err(error) => {
+            eprintln!("Error: {error}");
+            ExitCode::FAILURE
+        }
+    }
+}
