@@ -125,6 +125,22 @@ pub enum Error {
     /// The tokenizer lacks a token or could not encode.
     #[error("tokenizer: {0}")]
     Tokenizer(String),
+    /// A revision of a hub repository is not complete in the local cache, and was not fetched (feature `hub`).
+    #[error("{repository} at {revision}: {missing:?} not in the cache {}: {reason}", cache.display())]
+    Hub {
+        /// `OWNER/NAME`.
+        repository: String,
+        /// Branch, tag or commit.
+        revision: Box<str>,
+        /// Folder of the cache.
+        cache: Box<Path>,
+        /// The files that are needed and not there.
+        missing: Vec<String>,
+        /// Whether requests were forbidden.
+        offline: bool,
+        /// Why they were not fetched.
+        reason: String,
+    },
     /// The caller asked to stop.
     #[error("cancelled")]
     Cancelled,

@@ -16,6 +16,8 @@ pub mod error;
 mod files;
 pub mod frame;
 pub mod fusion;
+#[cfg(feature = "hub")]
+pub mod hub;
 pub mod kernels;
 pub mod model;
 pub mod query;
