@@ -1,7 +1,7 @@
 //! What the loaders share: lists of files, pairs, depth files of the picture's size.
 
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 
 use image::RgbImage;
 
@@ -61,6 +61,58 @@ pub(super) fn all_taken(files: Listed, expected: impl FnOnce(&str) -> String) ->
         None => Ok(()),
         Some((name, path)) => Err(unpaired(&path, "picture", expected(&name))),
     }
+}
+
+/// A relative path of a list file as a path below `root`. A list must not lead out of its data set.
+pub(super) fn below(root: &Path, relative: &str, list: &Path) -> Result<PathBuf> {
+    let path = Path::new(relative);
+    let inside = path.components().all(|c| matches!(c, Component::Normal(_) | Component::CurDir));
+    if inside && path.file_name().is_some() {
+        return Ok(root.join(path));
+    }
+    Err(Error::format(list, format!("path {relative:?}"), "a relative path inside the data set"))
+}
+
+/// The lines of a text file that are neither empty nor comments (`#`), without the space around them.
+pub(super) fn lines(path: &Path) -> Result<Vec<String>> {
+    let text = fs::read(path).map_err(Error::io(path))?;
+    let text = String::from_utf8(text).map_err(|_| Error::format(path, "no UTF-8 text", "a text file"))?;
+    let used = text.lines().map(str::trim).filter(|l| !l.is_empty() && !l.starts_with('#'));
+    Ok(used.map(str::to_string).collect())
+}
+
+/// The first of some places below `dir` that holds a file or folder of this name.
+pub(super) fn first_with(dir: &Path, places: &[&str], marker: &str) -> Result<PathBuf> {
+    let mut found = places.iter().map(|place| dir.join(place)).filter(|d| d.join(marker).exists());
+    found.next().ok_or_else(|| Error::format(dir, format!("no {marker}"), format!("{marker} in it")))
+}
+
+/// The recordings of a folder: itself, or the folders in it that hold all of the marks, by name. A recording's name is empty
+/// when it is the folder itself.
+pub(super) fn recordings(dir: &Path, marks: [&str; 2]) -> Result<Listed> {
+    let whole = |d: &Path| marks.iter().all(|m| d.join(m).exists());
+    if whole(dir) {
+        return Ok(vec![(String::new(), dir.to_path_buf())]);
+    }
+    let mut found = Vec::new();
+    for entry in fs::read_dir(dir).map_err(Error::io(dir))? {
+        let path = entry.map_err(Error::io(dir))?.path();
+        if let (true, Some(name)) = (whole(&path), path.file_name().and_then(|n| n.to_str())) {
+            found.push((name.to_string(), path.clone()));
+        }
+    }
+    found.sort();
+    let [one, other] = marks;
+    if found.is_empty() {
+        let expected = format!("{one} and {other}, or folders that hold them");
+        return Err(Error::format(dir, "no recording", expected));
+    }
+    Ok(found)
+}
+
+/// A frame's name from its recording's.
+pub(super) fn frame_name(recording: &str, frame: &str) -> String {
+    if recording.is_empty() { frame.to_string() } else { format!("{recording}-{frame}") }
 }
 
 /// The picture, named in every error.

@@ -8,8 +8,18 @@
 //! Everything is read from the user's own copy; nothing is downloaded. Files are not trusted: sizes that they claim are
 //! checked against what is really there before memory is set aside, and every error names the file.
 
+mod ddad;
 mod files;
 mod folder;
+mod hdf5;
+mod ibims;
+mod kitti;
+mod mat;
+mod nyu;
+pub mod outliers;
+mod scannet;
+mod tum;
+mod void;
 
 use std::path::Path;
 use std::str::FromStr;
@@ -21,7 +31,14 @@ use rand_chacha::ChaCha8Rng;
 use crate::depth::{DepthScale, SparseDepth};
 use crate::error::{Error, Result};
 use crate::scenes::SparsePattern;
+pub use ddad::DdadDataset;
 pub use folder::{DepthFile, FolderDataset, write_frame};
+pub use ibims::IbimsDataset;
+pub use kitti::KittiDataset;
+pub use nyu::NyuDataset;
+pub use scannet::ScanNetDataset;
+pub use tum::TumDataset;
+pub use void::VoidDataset;
 
 /// Frames with ground truth, in a fixed order. Opening lists files, loading reads them.
 pub trait Dataset: Send + Sync {
@@ -102,11 +119,24 @@ pub fn frame_seed(seed: u64, index: usize) -> u64 {
 pub enum Layout {
     /// `folder`: `rgb/`, `gt/` and perhaps `sparse/`, as Marigold-DC's scripts write them; see [`FolderDataset`].
     Folder,
+    /// `nyu`: NYU Depth V2 in HDF5; see [`NyuDataset`].
+    Nyu,
+    /// `void`: one density of VOID; see [`VoidDataset`].
+    Void,
+    /// `ibims`: iBims-1 in MATLAB files; see [`IbimsDataset`].
+    Ibims,
+    /// `kitti`: the validation selection of KITTI depth completion; see [`KittiDataset`].
+    Kitti,
+    /// `ddad`: the front camera of DDAD; see [`DdadDataset`].
+    Ddad,
+    /// `tum`: TUM RGB-D recordings; see [`TumDataset`].
+    Tum,
+    /// `scannet`: exported ScanNet scenes; see [`ScanNetDataset`].
+    ScanNet,
 }
 
 /// What may be chosen when a data set is opened.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-#[non_exhaustive]
 pub struct LayoutOptions {
     /// Unit of the integer files of [`Layout::Folder`]. The other layouts have a unit of their own and refuse another.
     pub scale: Option<DepthScale>,
@@ -119,27 +149,52 @@ pub struct LayoutOptions {
 
 impl Layout {
     /// Every layout.
-    pub const ALL: [Layout; 1] = [Layout::Folder];
+    pub const ALL: [Layout; 8] = [
+        Layout::Folder,
+        Layout::Nyu,
+        Layout::Void,
+        Layout::Ibims,
+        Layout::Kitti,
+        Layout::Ddad,
+        Layout::Tum,
+        Layout::ScanNet,
+    ];
 
     /// The name that [`Layout::from_str`] reads.
     pub fn name(self) -> &'static str {
         match self {
             Layout::Folder => "folder",
+            Layout::Nyu => "nyu",
+            Layout::Void => "void",
+            Layout::Ibims => "ibims",
+            Layout::Kitti => "kitti",
+            Layout::Ddad => "ddad",
+            Layout::Tum => "tum",
+            Layout::ScanNet => "scannet",
         }
     }
 
-    /// Number of points that the benchmark's protocol draws from the ground truth; `None` where the data set has measurements
-    /// of its own or leaves the number open.
+    /// Number of points that the benchmark's protocol draws from the ground truth (ScanNet: Marigold-DC's); `None` where the
+    /// data set has measurements of its own or leaves the number open.
     pub fn points(self) -> Option<usize> {
         match self {
-            Layout::Folder => None,
+            Layout::Nyu | Layout::ScanNet => Some(500),
+            Layout::Ibims => Some(1000),
+            Layout::Folder | Layout::Void | Layout::Kitti | Layout::Ddad | Layout::Tum => None,
         }
     }
 
-    /// Number of test frames of the whole published benchmark, where there is one.
+    /// Number of test frames of the whole published benchmark (ScanNet: Marigold-DC's choice), where there is one. A copy may
+    /// hold fewer.
     pub fn frames(self) -> Option<usize> {
         match self {
-            Layout::Folder => None,
+            Layout::Nyu => Some(654),
+            Layout::Void => Some(800),
+            Layout::Ibims => Some(100),
+            Layout::Kitti => Some(1000),
+            Layout::Ddad => Some(3950),
+            Layout::ScanNet => Some(745),
+            Layout::Folder | Layout::Tum => None,
         }
     }
 
@@ -156,6 +211,13 @@ impl Layout {
         }
         let frames: Box<dyn Dataset> = match self {
             Layout::Folder => Box::new(FolderDataset::open(path, options.scale)?),
+            Layout::Nyu => Box::new(NyuDataset::open(path)?),
+            Layout::Void => Box::new(VoidDataset::open(path)?),
+            Layout::Ibims => Box::new(IbimsDataset::open(path)?),
+            Layout::Kitti => Box::new(KittiDataset::open(path)?),
+            Layout::Ddad => Box::new(DdadDataset::open(path, options.seed)?),
+            Layout::Tum => Box::new(TumDataset::open(path)?),
+            Layout::ScanNet => Box::new(ScanNetDataset::open(path)?),
         };
         match options.range {
             None => Ok(frames),

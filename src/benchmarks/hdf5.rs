@@ -1,0 +1,82 @@
+//! HDF5 files through the crate `hdf5-reader`: arrays of numbers, with limits on what a file may ask for.
+
+use std::path::{Path, PathBuf};
+
+use hdf5_reader::{Datatype, Hdf5File, OpenOptions, SliceInfo, SliceInfoElem};
+
+use crate::error::{Error, Result};
+
+/// Largest array read at once, bytes: a picture of 16 megapixels in f64.
+const LARGEST_READ: usize = 1 << 27;
+
+/// An open file.
+pub(super) struct Numbers {
+    path: PathBuf,
+    file: Hdf5File,
+    size: u64,
+}
+
+impl Numbers {
+    /// Opens a file; only its structure is read.
+    pub(super) fn open(path: &Path) -> Result<Self> {
+        // Opening by the crate reports an absent file without its name.
+        let size = std::fs::metadata(path).map_err(Error::io(path))?.len();
+        let options =
+            OpenOptions { max_read_bytes: LARGEST_READ, max_chunk_bytes: LARGEST_READ, ..Default::default() };
+        let file = Hdf5File::open_with_options(path, options);
+        let file = file.map_err(|e| Error::format(path, e.to_string(), "an HDF5 file"))?;
+        Ok(Self { path: path.to_path_buf(), file, size })
+    }
+
+    /// Bytes of the file.
+    pub(super) fn size(&self) -> u64 {
+        self.size
+    }
+
+    /// Lengths of a data set.
+    pub(super) fn shape(&self, name: &str) -> Result<Vec<usize>> {
+        let data = self.file.dataset(name).map_err(|e| self.wrong(name, e.to_string()))?;
+        // A length beyond the machine's can only be a lie; the largest number fails every later check.
+        Ok(data.shape().iter().map(|&n| usize::try_from(n).unwrap_or(usize::MAX)).collect())
+    }
+
+    /// 8-bit values, of the whole data set or of one index of its first axis.
+    pub(super) fn bytes(&self, name: &str, index: Option<usize>) -> Result<Vec<u8>> {
+        let data = self.file.dataset(name).map_err(|e| self.wrong(name, e.to_string()))?;
+        let values = data.read_slice::<u8>(&selection(data.ndim(), index));
+        Ok(values.map_err(|e| self.wrong(name, e.to_string()))?.iter().copied().collect())
+    }
+
+    /// Floating-point values (f32 or f64), of the whole data set or of one index of its first axis.
+    pub(super) fn floats(&self, name: &str, index: Option<usize>) -> Result<Vec<f32>> {
+        let data = self.file.dataset(name).map_err(|e| self.wrong(name, e.to_string()))?;
+        let selection = selection(data.ndim(), index);
+        let values = match data.dtype() {
+            Datatype::FloatingPoint { size: 4, .. } => {
+                data.read_slice::<f32>(&selection).map(|a| a.iter().copied().collect())
+            }
+            Datatype::FloatingPoint { size: 8, .. } => {
+                data.read_slice::<f64>(&selection).map(|a| a.iter().map(|&v| v as f32).collect())
+            }
+            other => return Err(self.wrong(name, format!("elements {other:?}"))),
+        };
+        values.map_err(|e| self.wrong(name, e.to_string()))
+    }
+
+    /// The error for a data set that is not what it should be.
+    pub(super) fn wrong(&self, name: &str, found: String) -> Error {
+        Error::format(
+            &self.path,
+            format!("data set `{name}`: {found}"),
+            "8-bit `rgb` or `img`, floating-point depth",
+        )
+    }
+}
+
+fn selection(axes: usize, index: Option<usize>) -> SliceInfo {
+    let mut all = SliceInfo::all(axes);
+    if let (Some(index), Some(first)) = (index, all.selections.first_mut()) {
+        *first = SliceInfoElem::Index(index as u64);
+    }
+    all
+}
