@@ -196,7 +196,7 @@ def save_model(model):
 class Catch:
     """Module outputs and index functions of one forward pass."""
 
-    def __init__(self, model, golden, case, full):
+    def __init__(self, model, golden, case, full, tables):
         self.golden, self.case, self.handles, self.patched = golden, case, [], []
         visual, text = model.model.visual, model.model.language_model
         self.hook(visual.patch_embed, "patch_embed")
@@ -207,7 +207,7 @@ class Catch:
         for i, layer in enumerate(text.layers):
             self.hook(layer, f"text_layer_{i}")
         self.hook(text.norm, "text_final_norm")
-        if case == "b":
+        if tables:
             self.hook(visual.rotary_pos_emb, "vision_cos", "vision_sin")
             self.hook(text.rotary_emb, "text_cos", "text_sin")
         self.handles.append(text.register_forward_pre_hook(self.text_input, with_kwargs=True))
@@ -263,7 +263,7 @@ def run_case(model, golden, images, case):
     kinds = (ids == IMAGE).int()
     inputs = {"input_ids": ids, "pixel_values": rows, "image_grid_thw": grids, "mm_token_type_ids": kinds}
     golden[f"{case}.input_ids"], golden[f"{case}.grid_thw"] = ids[0], grids
-    catch = Catch(model, golden, case, full=case != "ab")
+    catch = Catch(model, golden, case, full=case != "ab", tables=case == "b")
     features = model.model.get_image_features(rows, grids, return_dict=True).pooler_output
     out = model(**inputs, attention_mask=torch.ones_like(ids), use_cache=False)
     catch.close()
