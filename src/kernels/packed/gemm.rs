@@ -21,14 +21,34 @@ const TALLEST: usize = 12;
 pub(super) struct Finish<'a> {
     /// One value per channel.
     pub(super) bias: Option<&'a [f32]>,
+    /// For sums that are integers.
+    pub(super) channels: Option<Channels<'a>>,
+}
+
+/// What turns the integer sums of each channel into its outputs.
+#[derive(Clone, Copy)]
+pub(super) struct Channels<'a> {
+    pub(super) scales: &'a [f32],
+    /// What the sums are too large by, activations being unsigned.
+    pub(super) offsets: &'a [i32],
 }
 
 impl Finish<'_> {
     /// One row of a panel, from channel `first` on.
     #[inline(always)]
-    fn row(&self, sums: &[u32], first: usize, out: &mut [f32]) {
-        for (o, sum) in out.iter_mut().zip(sums) {
-            *o = f32::from_bits(*sum);
+    fn row(&self, sums: &[u32], scale: f32, first: usize, out: &mut [f32]) {
+        match self.channels {
+            None => {
+                for (o, sum) in out.iter_mut().zip(sums) {
+                    *o = f32::from_bits(*sum);
+                }
+            }
+            Some(Channels { scales, offsets }) => {
+                let channels = scales[first..].iter().zip(&offsets[first..]);
+                for ((o, sum), (by, offset)) in out.iter_mut().zip(sums).zip(channels) {
+                    *o = (*sum as i32 - offset) as f32 * (scale * by);
+                }
+            }
         }
         if let Some(bias) = self.bias {
             for (o, bias) in out.iter_mut().zip(&bias[first..]) {
@@ -137,7 +157,7 @@ pub(super) unsafe fn run<D: Dot>(job: &Job<'_>, target: Target, rows: Range<usiz
                 for (r, sums) in sums.chunks_exact(WIDTH).enumerate() {
                     // SAFETY: the caller's promise; the panel's last column is below `m`.
                     let out = unsafe { target.row(row + r, columns.clone()) };
-                    job.finish.row(sums, columns.start, out);
+                    job.finish.row(sums, left.scales[row + r], columns.start, out);
                 }
             }
         }

@@ -3,9 +3,10 @@
 use super::super::level::Level;
 use super::super::vector::Baseline;
 use super::WeightFormat;
+use super::dot_bf16::Widened;
 use super::gemm::{Job, Target, run};
 use super::lhs;
-use super::tile::Widened;
+use super::quantise;
 use std::ops::Range;
 use std::sync::Once;
 
@@ -17,11 +18,11 @@ pub(super) struct Kernel {
     pub(super) per_step: usize,
     /// Words of a row in one step.
     pub(super) words: usize,
-    /// Converts a row of activations.
+    /// Converts a row of activations; returns its scale.
     ///
     /// # Safety
     /// The CPU must have the kernel's instructions, as it has where a `Kernel` exists.
-    pub(super) convert: unsafe fn(&mut [u32], &[f32]),
+    pub(super) convert: unsafe fn(&mut [u32], &[f32]) -> f32,
     /// [`run`] for the kernel's way of adding; safety as there.
     pub(super) run: unsafe fn(&Job<'_>, Target, Range<usize>, Range<usize>),
 }
@@ -32,7 +33,7 @@ macro_rules! kernel {
         $(#[$meta])*
         pub(super) const $constant: Kernel = {
             $(#[target_feature(enable = $features)])?
-            unsafe fn convert(words: &mut [u32], x: &[f32]) {
+            unsafe fn convert(words: &mut [u32], x: &[f32]) -> f32 {
                 $convert(words, x)
             }
             $(#[target_feature(enable = $features)])?
@@ -46,13 +47,36 @@ macro_rules! kernel {
 }
 
 kernel!(BF16_PORTABLE = "portable", 2, 2, lhs::widened, Widened<Baseline, 6>);
+#[cfg(not(target_arch = "x86_64"))]
+kernel!(INT8_PORTABLE = "portable", 4, 2, quantise::unsigned_pairs, super::dot_int8::Four);
+#[cfg(target_arch = "x86_64")]
+kernel!(INT8_PORTABLE = "portable", 4, 2, quantise::unsigned_pairs, super::dot_int8::x86::Pairs128);
 #[cfg(target_arch = "x86_64")]
 mod x86 {
-    use super::super::tile::x86::Bf16;
+    use super::super::dot_bf16::x86::Bf16;
+    use super::super::dot_int8::x86::{Pairs256, Pairs512, Vnni256, Vnni512};
     use super::*;
     use std::arch::x86_64::{__m256, __m512};
     kernel!(BF16_AVX2 = "avx2", 2, 2, lhs::widened, Widened<__m256, 6>, "avx2,fma");
     kernel!(BF16_AVX512 = "avx512", 2, 2, lhs::widened, Widened<__m512, 12>, "avx512f,avx512vl,avx512dq,avx512bw,avx2,fma");
+    kernel!(INT8_AVX2 = "avx2", 4, 2, quantise::unsigned_pairs, Pairs256, "avx2,fma");
+    kernel!(INT8_AVX2_VNNI = "avx2-vnni", 4, 1, quantise::unsigned_bytes, Vnni256, "avxvnni,avx2,fma");
+    kernel!(
+        INT8_AVX512 = "avx512",
+        4,
+        2,
+        quantise::unsigned_pairs,
+        Pairs512,
+        "avx512f,avx512vl,avx512dq,avx512bw,avx2,fma"
+    );
+    kernel!(
+        INT8_AVX512_VNNI = "avx512-vnni",
+        4,
+        1,
+        quantise::unsigned_bytes,
+        Vnni512,
+        "avx512vnni,avx512f,avx512vl,avx512dq,avx512bw,avx2,fma"
+    );
     kernel!(
         BF16_DOT = "avx512-bf16",
         2,
@@ -63,32 +87,38 @@ mod x86 {
     );
 }
 
+/// The kernels of a level: without its extensions, and with those that the machine has.
+pub(super) fn kernels(level: Level, format: WeightFormat) -> (Kernel, Option<Kernel>) {
+    let int8 = format == WeightFormat::Int8;
+    #[cfg(target_arch = "x86_64")]
+    {
+        if level.is_avx512() && int8 {
+            return (
+                x86::INT8_AVX512,
+                is_x86_feature_detected!("avx512vnni").then_some(x86::INT8_AVX512_VNNI),
+            );
+        }
+        if level.is_avx512() {
+            return (x86::BF16_AVX512, is_x86_feature_detected!("avx512bf16").then_some(x86::BF16_DOT));
+        }
+        if level.is_avx2() && int8 {
+            return (x86::INT8_AVX2, is_x86_feature_detected!("avxvnni").then_some(x86::INT8_AVX2_VNNI));
+        }
+        if level.is_avx2() {
+            return (x86::BF16_AVX2, None);
+        }
+    }
+    let _ = level;
+    (if int8 { INT8_PORTABLE } else { BF16_PORTABLE }, None)
+}
+
 impl Kernel {
-    /// The kernel of the level in use.
+    /// The fastest kernel of the level in use.
     pub(super) fn current(format: WeightFormat) -> Kernel {
         static TOLD: Once = Once::new();
-        let kernels = Kernel::at(Level::current(), format);
-        let kernel = kernels.last().copied().unwrap_or(BF16_PORTABLE);
+        let (plain, extended) = kernels(Level::current(), format);
+        let kernel = extended.unwrap_or(plain);
         TOLD.call_once(|| tracing::debug!("packed weights are multiplied by the {} kernel", kernel.name));
         kernel
-    }
-
-    /// The kernels of a level, slowest first: with and without its extensions.
-    pub(super) fn at(level: Level, _format: WeightFormat) -> Vec<Kernel> {
-        #[cfg(target_arch = "x86_64")]
-        {
-            if level.is_avx512() {
-                let mut kernels = vec![x86::BF16_AVX512];
-                if is_x86_feature_detected!("avx512bf16") {
-                    kernels.push(x86::BF16_DOT);
-                }
-                return kernels;
-            }
-            if level.is_avx2() {
-                return vec![x86::BF16_AVX2];
-            }
-        }
-        let _ = level;
-        vec![BF16_PORTABLE]
     }
 }

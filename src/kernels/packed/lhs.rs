@@ -14,6 +14,8 @@ pub(super) struct Left {
     words: Words,
     pub(super) n: usize,
     pub(super) stride: usize,
+    /// What each row's integers are multiples of; 1 where the words are floats.
+    pub(super) scales: Vec<f32>,
 }
 
 impl Left {
@@ -21,16 +23,18 @@ impl Left {
     pub(super) fn new(kernel: Kernel, x: &[f32], n: usize, k: usize) -> Self {
         let stride = ((k.div_ceil(kernel.per_step) * kernel.words).div_ceil(16) | 1) * 16;
         let mut words = Words::zeros(n * stride);
+        let mut scales = vec![1f32; n];
         if k > 0 {
             let rows = words.get_mut().par_chunks_mut(ROWS * stride).zip(x.par_chunks(ROWS * k));
-            rows.for_each(|(words, x)| {
-                for (words, x) in words.chunks_exact_mut(stride).zip(x.chunks_exact(k)) {
+            rows.zip(scales.par_chunks_mut(ROWS)).for_each(|((words, x), scales)| {
+                let rows = words.chunks_exact_mut(stride).zip(x.chunks_exact(k));
+                for ((words, x), scale) in rows.zip(scales) {
                     // SAFETY: a `Kernel` exists only where the CPU has its instructions.
-                    unsafe { (kernel.convert)(words, x) }
+                    *scale = unsafe { (kernel.convert)(words, x) };
                 }
             });
         }
-        Left { words, n, stride }
+        Left { words, n, stride, scales }
     }
 
     pub(super) fn words(&self) -> &[u32] {
@@ -40,14 +44,16 @@ impl Left {
 
 /// Two bf16 to a word.
 #[inline(always)]
-pub(super) fn pairs(words: &mut [u32], x: &[f32]) {
+pub(super) fn pairs(words: &mut [u32], x: &[f32]) -> f32 {
     from_f32(x, words);
+    1.0
 }
 
 /// Rounded to bf16, but as f32: two words to a step.
 #[inline(always)]
-pub(super) fn widened(words: &mut [u32], x: &[f32]) {
+pub(super) fn widened(words: &mut [u32], x: &[f32]) -> f32 {
     for (word, x) in words.iter_mut().zip(x) {
         *word = bf16(*x) << 16;
     }
+    1.0
 }

@@ -6,19 +6,24 @@
 //! through the inner dimension: two bf16 or four signed bytes. That is what the dot-product
 //! instructions take (AVX512-BF16, VNNI, AMX), and what others widen in registers.
 
+mod dot_bf16;
+mod dot_int8;
 mod gemm;
 mod isa;
 mod lhs;
 mod panel;
+mod quantise;
 #[cfg(test)]
 mod tests;
+#[cfg(test)]
+mod tests_int8;
 mod tile;
 mod words;
 
 use super::exec::{dims2, expect_dims, read, tensor};
 use crate::error::{Error, Result};
 use candle_core::{DType, Tensor};
-use gemm::{Finish, Job};
+use gemm::{Channels, Finish, Job};
 use isa::Kernel;
 use lhs::Left;
 use panel::Panels;
@@ -44,7 +49,14 @@ pub enum WeightFormat {
 pub struct PackedWeight {
     panels: Panels,
     format: WeightFormat,
+    /// Of each channel, where the format is [`WeightFormat::Int8`].
+    scales: Vec<f32>,
+    /// 128 times the sum of each channel's bytes.
+    offsets: Vec<i32>,
 }
+
+/// Largest inner dimension of bytes: the sum of so many products of 255 and 127 is below 2^31.
+const LONGEST_INT8: usize = 1 << 16;
 
 impl PackedWeight {
     /// Packs `m * k` little-endian bf16 values, row-major, as a safetensors file holds them; any alignment.
@@ -57,10 +69,10 @@ impl PackedWeight {
             let (expected, found) = (2 * values, bytes.len());
             return Err(Error::BufferLength { what: "bf16 weight, in bytes", expected, found });
         }
-        let panels = Panels::build(m, k, 2, |row, words| {
+        let (panels, _) = Panels::build(m, k, 2, |row, words| {
             words::from_bf16_bytes(&bytes[row * 2 * k..(row + 1) * 2 * k], words);
         });
-        Ok(PackedWeight { panels, format: WeightFormat::Bf16 })
+        Ok(PackedWeight::bf16(panels))
     }
 
     /// Rounds `m * k` row-major values to bf16 (to nearest, ties to even) and packs them.
@@ -69,18 +81,37 @@ impl PackedWeight {
     /// [`Error::BufferLength`] where `values` does not hold `m * k` elements.
     pub fn bf16_from_f32(values: &[f32], m: usize, k: usize) -> Result<Self> {
         elements(values.len(), m, k)?;
-        let panels = Panels::build(m, k, 2, |row, words| {
+        let (panels, _) = Panels::build(m, k, 2, |row, words| {
             words::from_f32(&values[row * k..(row + 1) * k], words);
         });
-        Ok(PackedWeight { panels, format: WeightFormat::Bf16 })
+        Ok(PackedWeight::bf16(panels))
     }
 
-    /// From rows that `row` writes.
+    fn bf16(panels: Panels) -> Self {
+        PackedWeight { panels, format: WeightFormat::Bf16, scales: Vec::new(), offsets: Vec::new() }
+    }
+
+    /// Quantises the rows that `row(index, values)` writes: each output channel to bytes in -127 ..= 127 times its own scale, its
+    /// largest magnitude over 127. Rows are asked for once each, in any order, from several threads.
     ///
     /// # Errors
-    /// [`Error::Argument`]: not there yet.
-    pub fn int8_from_rows(_m: usize, _k: usize, _row: impl Fn(usize, &mut [f32]) + Sync) -> Result<Self> {
-        Err(Error::argument("weight format", "int8", "f32 or bf16"))
+    /// [`Error::Argument`] for a value that is not finite, or `k` above 65,536.
+    pub fn int8_from_rows(m: usize, k: usize, row: impl Fn(usize, &mut [f32]) + Sync) -> Result<Self> {
+        if k > LONGEST_INT8 {
+            return Err(Error::argument("inputs of an int8 weight", k, format!("at most {LONGEST_INT8}")));
+        }
+        let (panels, channels) = Panels::build(m, k, 4, |index, words| {
+            let mut values = vec![0f32; k];
+            row(index, &mut values);
+            quantise::weight_row(&values, words)
+        });
+        if let Some(bad) = channels.iter().position(|(scale, _)| scale.is_nan()) {
+            let found = format!("a value in row {bad} that is not finite");
+            return Err(Error::argument("int8 weight", found, "finite values"));
+        }
+        let (scales, offsets) =
+            channels.into_iter().map(|(scale, sum)| (scale, quantise::ZERO * sum)).unzip();
+        Ok(PackedWeight { panels, format: WeightFormat::Int8, scales, offsets })
     }
 
     /// Outputs and inputs `(m, k)`.
@@ -90,7 +121,7 @@ impl PackedWeight {
 
     /// Memory held, in bytes.
     pub fn bytes(&self) -> usize {
-        self.panels.bytes()
+        self.panels.bytes() + 4 * (self.scales.len() + self.offsets.len())
     }
 
     /// The format of the values.
@@ -100,8 +131,11 @@ impl PackedWeight {
 
     /// `x W^T + b`: `x` is `[n, k]`, `bias` `[m]`, both f32 on the CPU; gives `[n, m]`.
     ///
-    /// `x` is rounded to bf16 (to nearest even; NaN and infinities stay), products are summed in f32. Subnormal values of
+    /// bf16: `x` is rounded to bf16 (to nearest even; NaN and infinities stay), products are summed in f32. Subnormal values of
     /// `x` or the weight may count as zero: the AVX512-BF16 and AMX instructions read them so.
+    ///
+    /// int8: each row of `x` is quantised as a channel of the weight is, by its own scale; sums are exact, so that every
+    /// instruction set gives the same bits. A row with a value that is not finite gives NaN.
     ///
     /// # Errors
     /// [`Error::Argument`] for another shape, type or device.
@@ -120,7 +154,7 @@ impl PackedWeight {
         }
         let product = |x: &[f32], bias: Option<&[f32]>| {
             let left = Left::new(kernel, x, n, k);
-            let job = Job { kernel, left: &left, panels: &self.panels, finish: Finish { bias } };
+            let job = Job { kernel, left: &left, panels: &self.panels, finish: self.finish(bias) };
             let mut out = vec![0f32; n * m];
             job.run(&mut out);
             Ok(out)
@@ -130,6 +164,11 @@ impl PackedWeight {
             None => product(x, None),
         })?;
         Ok(tensor(out, (n, m))?)
+    }
+
+    fn finish<'a>(&'a self, bias: Option<&'a [f32]>) -> Finish<'a> {
+        let channels = Channels { scales: &self.scales, offsets: &self.offsets };
+        Finish { bias, channels: (self.format == WeightFormat::Int8).then_some(channels) }
     }
 
     /// Rows of the weight as f32 `[ids, k]`: an embedding lookup, or some rows of an output head.
@@ -144,13 +183,21 @@ impl PackedWeight {
         let mut out = vec![0f32; ids.len() * k];
         for (out, &id) in out.chunks_exact_mut(k.max(1)).zip(ids) {
             let words = self.panels.row(id as usize);
-            for (pair, word) in out.chunks_mut(2).zip(words) {
-                for (o, value) in pair.iter_mut().zip(words::halves(word)) {
-                    *o = value;
-                }
+            match self.scales.get(id as usize) {
+                None => spread(out, words.map(words::halves)),
+                Some(scale) => spread(out, words.map(|w| quantise::bytes(w).map(|byte| byte * scale))),
             }
         }
         Ok(tensor(out, (ids.len(), k))?)
+    }
+}
+
+/// Writes the values of words; the last word may hold more than there is room for.
+fn spread<const N: usize>(out: &mut [f32], words: impl Iterator<Item = [f32; N]>) {
+    for (out, word) in out.chunks_mut(N).zip(words) {
+        for (o, value) in out.iter_mut().zip(word) {
+            *o = value;
+        }
     }
 }
 

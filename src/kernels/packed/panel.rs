@@ -44,28 +44,31 @@ pub(super) struct Panels {
 }
 
 impl Panels {
-    /// Packs rows that `fill(row, words)` writes, `per_step` values to a word.
-    pub(super) fn build(
+    /// Packs rows that `fill(row, words)` writes, `per_step` values to a word. Also gives what it returned for each row.
+    pub(super) fn build<T: Send>(
         m: usize,
         k: usize,
         per_step: usize,
-        fill: impl Fn(usize, &mut [u32]) + Sync,
-    ) -> Self {
+        fill: impl Fn(usize, &mut [u32]) -> T + Sync,
+    ) -> (Self, Vec<T>) {
         let steps = k.div_ceil(per_step);
         let mut words = Words::zeros(m.div_ceil(WIDTH) * WIDTH * steps);
-        let pack = |rows: &mut Vec<u32>, (p, panel): (usize, &mut [u32])| {
+        if steps == 0 {
+            let results = (0..m).map(|row| fill(row, &mut [])).collect();
+            return (Panels { words, m, k, steps }, results);
+        }
+        let pack = |rows: &mut Vec<u32>, (p, panel): (usize, &mut [u32])| -> Vec<T> {
             let first = p * WIDTH;
             let count = WIDTH.min(m - first);
             rows.resize(WIDTH * steps, 0);
-            for (r, row) in rows.chunks_exact_mut(steps).take(count).enumerate() {
-                fill(first + r, row);
-            }
+            let filled = rows.chunks_exact_mut(steps).take(count).enumerate();
+            let results = filled.map(|(r, row)| fill(first + r, row)).collect();
             transpose(panel, rows, steps, count);
+            results
         };
-        if steps > 0 {
-            words.get_mut().par_chunks_exact_mut(WIDTH * steps).enumerate().for_each_init(Vec::new, pack);
-        }
-        Panels { words, m, k, steps }
+        let panels = words.get_mut().par_chunks_exact_mut(WIDTH * steps).enumerate();
+        let results: Vec<Vec<T>> = panels.map_init(Vec::new, pack).collect();
+        (Panels { words, m, k, steps }, results.into_iter().flatten().collect())
     }
 
     /// All panels.

@@ -2,24 +2,26 @@
 
 use super::super::level::Level;
 use super::super::testing::{random, same_on_any_thread_count, values};
+use super::isa::kernels;
 use super::words::{bf16, halves};
 use super::*;
 use candle_core::Device;
 
-fn every_kernel(format: WeightFormat) -> Vec<Kernel> {
-    Level::available().into_iter().flat_map(|level| Kernel::at(level, format)).collect()
+pub(super) fn every_kernel(format: WeightFormat) -> Vec<Kernel> {
+    let levels = Level::available().into_iter().map(|level| kernels(level, format));
+    levels.flat_map(|(plain, extended)| [Some(plain), extended]).flatten().collect()
 }
 
 fn rounded(values: &[f32]) -> Vec<f32> {
     values.iter().map(|v| halves(bf16(*v))[0]).collect()
 }
 
-fn matrix(values: Vec<f32>, n: usize, k: usize) -> Tensor {
+pub(super) fn matrix(values: Vec<f32>, n: usize, k: usize) -> Tensor {
     Tensor::from_vec(values, (n, k), &Device::Cpu).unwrap()
 }
 
 /// Inner dimensions, outputs and rows about every edge: of a word, a register, a panel, a block of steps.
-const SHAPES: [(usize, usize, usize); 14] = [
+pub(super) const SHAPES: [(usize, usize, usize); 14] = [
     (1, 1, 1),
     (0, 5, 3),
     (3, 0, 7),
@@ -101,7 +103,7 @@ fn every_element_is_written() {
         for kernel in every_kernel(WeightFormat::Bf16) {
             let left = Left::new(kernel, &x, n, k);
             let mut out = vec![f32::NAN; n * m];
-            let finish = Finish { bias: None };
+            let finish = packed.finish(None);
             Job { kernel, left: &left, panels: &packed.panels, finish }.run(&mut out);
             assert!(out.iter().all(|v| v.is_finite()), "{} {n}x{k}x{m}", kernel.name);
         }

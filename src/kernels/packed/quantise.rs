@@ -1,0 +1,136 @@
+//! Rounding rows of f32 to bytes, symmetric: `value = scale * byte`, byte in -127 ..= 127.
+
+/// Rows whose largest magnitude is below count as zeros, lest their scale be subnormal.
+const TINY: f32 = 1e-35;
+/// 1.5 * 2^23: a small value added to it is rounded to an integer, ties to even, in the low bits.
+const ROUND: f32 = 12_582_912.0;
+/// The largest byte.
+const LARGEST: f32 = 127.0;
+/// What stands for zero in an unsigned byte.
+pub(super) const ZERO: i32 = 128;
+
+/// The scale of a row and what to multiply its values by; NaN if a value is not finite, zeros for a row of zeros.
+#[inline(always)]
+pub(super) fn scale(values: &[f32]) -> (f32, f32) {
+    // Magnitudes order as their bits do, with infinity and NaN above all.
+    let mut largest = [0u32; 16];
+    let (chunks, rest) = values.as_chunks::<16>();
+    for chunk in chunks {
+        for (l, v) in largest.iter_mut().zip(chunk) {
+            *l = (*l).max(v.to_bits() & 0x7fff_ffff);
+        }
+    }
+    let bits = rest.iter().map(|v| v.to_bits() & 0x7fff_ffff).chain(largest).max().unwrap_or(0);
+    let largest = f32::from_bits(bits);
+    if !largest.is_finite() {
+        return (f32::NAN, 0.0);
+    }
+    if largest < TINY { (0.0, 0.0) } else { (largest / LARGEST, LARGEST / largest) }
+}
+
+/// `value * by` to the nearest integer.
+#[inline(always)]
+fn nearest(value: f32, by: f32) -> i32 {
+    // What is not finite gives some integer: its row's scale is NaN.
+    (value * by + ROUND).to_bits().wrapping_sub(ROUND.to_bits()) as i32
+}
+
+/// A row of a weight as words of four signed bytes. Returns its scale and the sum of its bytes.
+pub(super) fn weight_row(values: &[f32], words: &mut [u32]) -> (f32, i32) {
+    let (scale, by) = scale(values);
+    let mut sum = 0;
+    for (word, values) in words.iter_mut().zip(values.chunks(4)) {
+        let mut bytes = [0u8; 4];
+        for (byte, value) in bytes.iter_mut().zip(values) {
+            let integer = nearest(*value, by);
+            sum += integer;
+            *byte = integer as u8;
+        }
+        *word = u32::from_le_bytes(bytes);
+    }
+    (scale, sum)
+}
+
+/// The four signed bytes of a word.
+pub(super) fn bytes(word: u32) -> [f32; 4] {
+    word.to_le_bytes().map(|byte| f32::from(byte as i8))
+}
+
+/// A row of activations as words of four unsigned bytes, and its scale.
+#[inline(always)]
+pub(super) fn unsigned_bytes(words: &mut [u32], values: &[f32]) -> f32 {
+    let (scale, by) = scale(values);
+    let byte = |value: f32| (nearest(value, by) + ZERO) as u32 & 0xff;
+    let (chunks, rest) = values.as_chunks::<4>();
+    for (word, v) in words.iter_mut().zip(chunks) {
+        *word = byte(v[0]) | byte(v[1]) << 8 | byte(v[2]) << 16 | byte(v[3]) << 24;
+    }
+    if let Some(word) = words.get_mut(chunks.len()) {
+        *word = rest.iter().rev().fold(0, |word, v| word << 8 | byte(*v));
+    }
+    scale
+}
+
+/// The same as 16-bit pairs, two words to a step: values 0 and 2, then 1 and 3.
+#[inline(always)]
+pub(super) fn unsigned_pairs(words: &mut [u32], values: &[f32]) -> f32 {
+    let (scale, by) = scale(values);
+    let byte = |value: f32| (nearest(value, by) + ZERO) as u32 & 0xff;
+    let (chunks, rest) = values.as_chunks::<4>();
+    let (pairs, _) = words.as_chunks_mut::<2>();
+    for (words, v) in pairs.iter_mut().zip(chunks) {
+        *words = [byte(v[0]) | byte(v[2]) << 16, byte(v[1]) | byte(v[3]) << 16];
+    }
+    if let (Some(words), false) = (pairs.get_mut(chunks.len()), rest.is_empty()) {
+        let mut v = [0; 4];
+        for (v, value) in v.iter_mut().zip(rest) {
+            *v = byte(*value);
+        }
+        *words = [v[0] | v[2] << 16, v[1] | v[3] << 16];
+    }
+    scale
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_largest_becomes_127_and_ties_go_to_even() {
+        let mut words = [0u32; 2];
+        let (scale, sum) = weight_row(&[127.0, -127.0, 0.5, 1.5, -2.5], &mut words);
+        assert_eq!((scale, sum), (1.0, 0));
+        assert_eq!(words.map(bytes), [[127.0, -127.0, 0.0, 2.0], [-2.0, 0.0, 0.0, 0.0]]);
+    }
+
+    #[test]
+    fn both_forms_of_a_row_hold_the_same_values() {
+        for n in 1..40usize {
+            let values: Vec<f32> = (0..n).map(|i| (i as f32 * 7.7).sin()).collect();
+            let steps = n.div_ceil(4);
+            let (mut single, mut pairs) = (vec![0u32; steps], vec![0u32; 2 * steps]);
+            let scale = unsigned_bytes(&mut single, &values);
+            assert_eq!(scale, unsigned_pairs(&mut pairs, &values));
+            for i in 0..4 * steps {
+                let byte = single[i / 4] >> (8 * (i % 4)) & 0xff;
+                assert_eq!(byte, pairs[i / 4 * 2 + i % 2] >> (8 * (i % 4 & 2)) & 0xff);
+                let value = if i < n { values[i] } else { continue };
+                assert!(((byte as i32 - ZERO) as f32 * scale - value).abs() <= 0.5001 * scale);
+            }
+        }
+    }
+
+    #[test]
+    fn what_is_not_finite_has_no_scale() {
+        for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, -f32::NAN] {
+            let mut values = vec![1f32; 21];
+            for at in [0, 15, 20] {
+                values[at] = bad;
+                assert!(scale(&values).0.is_nan());
+                values[at] = 1.0;
+            }
+        }
+        assert_eq!(scale(&[0.0, -0.0, 1e-39]), (0.0, 0.0));
+        assert_eq!(scale(&[]), (0.0, 0.0));
+    }
+}
