@@ -113,7 +113,7 @@ mod tests {
             assert_eq!(scale, unsigned_pairs(&mut pairs, &values));
             for i in 0..4 * steps {
                 let byte = single[i / 4] >> (8 * (i % 4)) & 0xff;
-                assert_eq!(byte, pairs[i / 4 * 2 + i % 2] >> (8 * (i (i % 4 & 2) 2)) & 0xff);
+                assert_eq!(byte, pairs[i / 4 * 2 + i % 2] >> (8 * (i & 2)) & 0xff);
                 let value = if i < n { values[i] } else { continue };
                 assert!(((byte as i32 - ZERO) as f32 * scale - value).abs() <= 0.5001 * scale);
             }
