@@ -7,12 +7,12 @@ mod common;
 
 use anyhow::Context;
 use clap::Parser;
-use common::{load, rounded};
+use common::{load_as, rounded};
 use indicatif::{ProgressBar, ProgressStyle};
 use sdim::depth::metrics::{Errors, errors};
 use sdim::depth::{interpolate, preview};
-use sdim::system::peak_rss_bytes;
-use sdim::{CompleteOptions, DepthScale, QueryPlan, SparseDepth, read_rgb};
+use sdim::system::{device, peak_rss_bytes};
+use sdim::{CompleteOptions, DepthScale, LoadOptions, QueryPlan, SparseDepth, WeightFormat, read_rgb};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -38,6 +38,9 @@ struct Args {
     /// Adapter directory on top of --model.
     #[arg(long)]
     adapter: Option<PathBuf>,
+    /// How matrices are held: f32, bf16 or int8.
+    #[arg(long, default_value = "f32")]
+    weights: WeightFormat,
     /// Pixels to ask: every, stride:N or budget:N.
     #[arg(long, default_value_t = Default::default())]
     plan: QueryPlan,
@@ -95,7 +98,13 @@ fn main() -> anyhow::Result<()> {
     sdim::kernels::keep_freed_memory();
     let inputs = args.inputs();
     let start = Instant::now();
-    let completer = load(&args.model, args.adapter.as_deref(), &args.device)?;
+    let options = LoadOptions {
+        device: device(&args.device)?,
+        weights: args.weights,
+        adapter: args.adapter.clone(),
+        ..LoadOptions::default()
+    };
+    let completer = load_as(&args.model, &options)?;
     let rgb = read_rgb(&inputs.rgb)?;
     let sparse = SparseDepth::read(&inputs.sparse, inputs.scale)?;
     let gt = inputs.gt.as_ref().map(|p| SparseDepth::read(p, inputs.scale)).transpose()?;

@@ -144,6 +144,20 @@ pub struct LoadOptions {
     pub lora: LoraMode,
 }
 
+impl std::str::FromStr for WeightFormat {
+    type Err = Error;
+
+    /// `f32`, `bf16` or `int8`.
+    fn from_str(text: &str) -> Result<Self> {
+        match text {
+            "f32" => Ok(Self::F32),
+            "bf16" => Ok(Self::Bf16),
+            "int8" => Ok(Self::Int8),
+            other => Err(Error::argument("weight format", other, "f32, bf16 or int8")),
+        }
+    }
+}
+
 impl Default for LoadOptions {
     /// The CPU, f32, no adapter.
     fn default() -> Self {
