@@ -269,8 +269,7 @@ impl Decoder {
         let length = (rows / items) as u32;
         let last: Vec<u32> = (1..=items as u32).map(|i| i * length - 1).collect();
         let last = Tensor::from_vec(last, items, table.cos.device())?;
-        let table =
-            RopeTable { cos: table.cos.index_select(&last, 0)?, sin: table.sin.index_select(&last, 0)? };
+        let table = table.select(&last)?;
         let mut layout = layout.clone();
         for block in &mut layout.blocks {
             (block.queries, block.q_period) = (0..items, 1);

@@ -15,6 +15,9 @@ use std::path::Path;
 /// it may ask for more than there is memory. Missing matrices take no memory and do not count.
 const STAND_INS: usize = 1 << 28;
 
+/// Values of a tensor by its name and shape.
+type Maker = Box<dyn Fn(&str, &[usize]) -> Vec<f32>>;
+
 enum Source {
     /// In memory already: the trainer's variables, tests.
     Tensor(Tensor),
@@ -42,6 +45,7 @@ pub struct Weights {
     format: WeightFormat,
     sources: HashMap<String, Source>,
     lora: LoraSet,
+    made: Option<Maker>,
     read: RefCell<BTreeSet<String>>,
     missing: RefCell<BTreeMap<String, Vec<usize>>>,
 }
@@ -67,6 +71,7 @@ impl Weights {
             format: WeightFormat::F32,
             sources: HashMap::new(),
             lora: LoraSet::default(),
+            made: None,
             read: RefCell::default(),
             missing: RefCell::default(),
         }
@@ -76,6 +81,14 @@ impl Weights {
     pub fn from_tensors(file: &str, tensors: HashMap<String, Tensor>) -> Self {
         let mut weights = Self::empty(file, &Device::Cpu);
         weights.sources = tensors.into_iter().map(|(name, t)| (name, Source::Tensor(t))).collect();
+        weights
+    }
+
+    /// Tensors whose values `make` gives by name and shape when they are asked for: random models of any size, which
+    /// need no more memory than their weights. Nothing is ever missing.
+    pub fn made(make: impl Fn(&str, &[usize]) -> Vec<f32> + 'static, device: &Device) -> Self {
+        let mut weights = Self::empty("made", device);
+        weights.made = Some(Box::new(make));
         weights
     }
 
@@ -174,10 +187,13 @@ impl Weights {
         match self.find(name, shape)? {
             Some(Source::Tensor(t)) => Ok(t.to_dtype(DType::F32)?),
             Some(Source::Stored(s)) => s.f32(&self.device),
-            None => {
-                self.miss(name, shape, true)?;
-                Ok(Tensor::zeros(shape, DType::F32, &Device::Cpu)?)
-            }
+            None => self.make(name, shape)?.map_or_else(
+                || {
+                    self.miss(name, shape, true)?;
+                    Ok(Tensor::zeros(shape, DType::F32, &Device::Cpu)?)
+                },
+                Ok,
+            ),
         }
     }
 
@@ -194,11 +210,19 @@ impl Weights {
                 None => Matrix::from_stored(s, self.format, &self.device),
             },
             None => {
+                if let Some(made) = self.make(name, &shape)? {
+                    return Matrix::from_tensor(&made, added, self.format);
+                }
                 self.miss(name, &shape, false)?;
                 let zero = Tensor::zeros((1, 1), DType::F32, &Device::Cpu)?;
                 Ok(Matrix::Plain(zero.broadcast_as(&shape)?))
             }
         }
+    }
+
+    fn make(&self, name: &str, shape: &[usize]) -> Result<Option<Tensor>> {
+        let made = self.made.as_ref().map(|make| Tensor::from_vec(make(name, shape), shape, &self.device));
+        Ok(made.transpose()?)
     }
 
     fn miss(&self, name: &str, shape: &[usize], allocated: bool) -> Result<()> {

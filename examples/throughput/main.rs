@@ -1,0 +1,222 @@
+//! Seconds, operations and memory of each stage: vision encoder, shared prefix, a batch of pixel queries.
+//!
+//! ```text
+//! cargo run --release --example throughput -- --random 3b --queries 64 --suffix-tokens 1 --digits 5
+//! ```
+
+mod cost;
+mod shapes;
+
+use anyhow::{Context as _, bail};
+use candle_core::{Device, Tensor};
+use clap::Parser;
+use sdim::WeightFormat;
+use sdim::kernels;
+use sdim::system::{device, peak_rss_bytes};
+use sdim::vlm::QwenVl;
+use sdim::vlm::cache::KvCache;
+use sdim::vlm::config::VlmConfig;
+use sdim::vlm::decoder::{Context, Keep};
+use sdim::vlm::grid::Grid;
+use sdim::vlm::prompt::positions;
+use sdim::vlm::rope::{Position, RopeLayout};
+use sdim::vlm::weights::Weights;
+use serde_json::json;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+#[derive(Parser)]
+#[command(about = "Times the stages of a model on one image and many pixel queries")]
+struct Args {
+    /// Checkpoint directory.
+    #[arg(long, required_unless_present = "random")]
+    model: Option<PathBuf>,
+    /// Random weights of the shapes of: 3b, 7b or tiny.
+    #[arg(long, conflicts_with = "model")]
+    random: Option<String>,
+    /// Width of the image as the encoder sees it, pixels; rounded up to whole merged patches.
+    #[arg(long, default_value_t = 644)]
+    width: usize,
+    /// Height of the image as the encoder sees it, pixels; rounded up to whole merged patches.
+    #[arg(long, default_value_t = 476)]
+    height: usize,
+    /// Pixel queries.
+    #[arg(long, default_value_t = 64)]
+    queries: usize,
+    /// Tokens of a query before its answer.
+    #[arg(long, default_value_t = 1)]
+    suffix_tokens: usize,
+    /// Tokens of an answer.
+    #[arg(long, default_value_t = 5)]
+    digits: usize,
+    /// Queries of one batch.
+    #[arg(long, default_value_t = 512)]
+    batch: usize,
+    /// How matrices are held: f32, bf16 or int8.
+    #[arg(long, default_value = "bf16")]
+    weights: WeightFormat,
+    /// cpu, cuda:N or metal.
+    #[arg(long, default_value = "cpu")]
+    device: String,
+    /// One JSON object instead of the table.
+    #[arg(long)]
+    json: bool,
+}
+
+impl Args {
+    fn config(&self) -> anyhow::Result<VlmConfig> {
+        let (name, json) = match (&self.model, &self.random) {
+            (Some(dir), _) => {
+                let path = dir.join("config.json");
+                let text = std::fs::read(&path).with_context(|| path.display().to_string())?;
+                (path.display().to_string(), serde_json::from_slice(&text)?)
+            }
+            (None, Some(name)) => match shapes::config(name) {
+                Some(json) => (format!("--random {name}"), json),
+                None => bail!("--random {name}: no such model; expected 3b, 7b or tiny"),
+            },
+            (None, None) => bail!("--model or --random"),
+        };
+        Ok(VlmConfig::from_json(&name, &json)?)
+    }
+
+    fn load(&self, config: VlmConfig, device: &Device) -> anyhow::Result<QwenVl> {
+        let weights = match &self.model {
+            Some(dir) => Weights::from_dir(Path::new(dir), device)?,
+            None => Weights::made(shapes::random, device),
+        };
+        Ok(QwenVl::new(config, &weights.with_format(self.weights), RopeLayout::Contiguous)?)
+    }
+}
+
+/// Seconds and operations of a stage.
+struct Stage {
+    seconds: f64,
+    operations: f64,
+}
+
+impl Stage {
+    fn time<R>(operations: f64, run: impl FnOnce() -> anyhow::Result<R>) -> anyhow::Result<(R, Self)> {
+        let start = Instant::now();
+        let out = run()?;
+        Ok((out, Self { seconds: start.elapsed().as_secs_f64(), operations }))
+    }
+
+    fn gflops(&self) -> f64 {
+        self.operations / self.seconds.max(1e-9) * 1e-9
+    }
+}
+
+/// Words around the image of a prompt, tokens.
+const BEFORE: usize = 15;
+const AFTER: usize = 5;
+
+struct Run {
+    model: QwenVl,
+    device: Device,
+    grid: Grid,
+}
+
+impl Run {
+    fn encode(&self) -> anyhow::Result<Tensor> {
+        let shape = (self.grid.patches(), self.model.config.vision.patch_len());
+        let patches = Tensor::randn(0f32, 1.0, shape, &self.device)?;
+        let tokens = self.model.encode(&patches, &[self.grid])?;
+        self.device.synchronize()?;
+        Ok(tokens)
+    }
+
+    fn prefill(&self, image: &Tensor) -> anyhow::Result<(KvCache, f32)> {
+        let mut ids = vec![11u32; BEFORE];
+        ids.extend(std::iter::repeat_n(self.model.config.ids.image, image.dim(0)?));
+        ids.extend([12u32; AFTER]);
+        let walked = positions(&ids, &[self.grid], &self.model.config, 1.0)?;
+        let embedded = self.model.embed_prompt(&ids, image)?;
+        let mut cache = self.model.decoder.cache(1);
+        self.model.prefill(&embedded, &walked.positions, &mut cache, Keep::Nothing)?;
+        self.device.synchronize()?;
+        Ok((cache, walked.next))
+    }
+
+    /// Asks `args.queries` times, `args.batch` at once, and reads `args.digits` tokens greedily.
+    fn ask(&self, prefix: &KvCache, next: f32, args: &Args) -> anyhow::Result<()> {
+        let decoder = &self.model.decoder;
+        let number_ids: Vec<u32> = (13..24).collect();
+        let rows = decoder.head_rows(&number_ids)?;
+        let mut left = args.queries;
+        while left > 0 {
+            let items = left.min(args.batch.max(1));
+            left -= items;
+            let mut own = decoder.cache(items);
+            let mut ids: Vec<u32> = (0..items * args.suffix_tokens).map(|i| 11 + (i % 13) as u32).collect();
+            let (mut at, mut length) = (next, args.suffix_tokens);
+            for _ in 0..args.digits {
+                let text = (0..items).flat_map(|_| (0..length).map(|i| Position::text(at + i as f32)));
+                let table = decoder.rope().table(&text.collect::<Vec<_>>(), &self.device)?;
+                let context = Context::Cached { shared: Some(prefix), own: &mut own };
+                let hidden = decoder.forward_keeping(&decoder.embed(&ids)?, &table, context, Keep::Last)?;
+                let logits = kernels::linear(&decoder.final_norm(&hidden)?, &rows, None)?;
+                let best = logits.argmax(1)?.to_vec1::<u32>()?;
+                ids = best.into_iter().map(|i| number_ids[i as usize]).collect();
+                (at, length) = (at + length as f32, 1);
+            }
+        }
+        Ok(())
+    }
+}
+
+fn main() -> anyhow::Result<()> {
+    let args = Args::parse();
+    kernels::keep_freed_memory();
+    if args.suffix_tokens == 0 || args.digits == 0 || args.queries == 0 {
+        bail!("--queries, --suffix-tokens and --digits: at least 1 each");
+    }
+    let device = device(&args.device)?;
+    let config = args.config()?;
+    let side = config.vision.patch_size * config.vision.merge_size;
+    let cells = |pixels: usize| pixels.div_ceil(side).max(1) * config.vision.merge_size;
+    let grid = Grid { height: cells(args.height), width: cells(args.width) };
+    let cost = cost::Cost::new(&config, grid);
+    let (model, load) = Stage::time(0.0, || args.load(config.clone(), &device))?;
+    let run = Run { model, device, grid };
+    let (image, vision) = Stage::time(cost.vision(), || run.encode())?;
+    let prompt = BEFORE + image.dim(0)? + AFTER;
+    let ((cache, next), prefill) = Stage::time(cost.prefill(prompt), || run.prefill(&image))?;
+    let asked = cost.query(prompt, args.suffix_tokens, args.digits) * args.queries as f64;
+    let ((), queries) = Stage::time(asked, || run.ask(&cache, next, &args))?;
+    let peak = kernels::peak_gflops(args.weights);
+    report(&args, &load, [&vision, &prefill, &queries], peak, prompt);
+    Ok(())
+}
+
+fn report(args: &Args, load: &Stage, stages: [&Stage; 3], peak: f64, prompt: usize) {
+    let [vision, prefill, queries] = stages;
+    let per_second = args.queries as f64 / queries.seconds;
+    let tokens = args.suffix_tokens + args.digits - 1;
+    let rss = peak_rss_bytes().unwrap_or(0);
+    if args.json {
+        let line = json!({
+            "load_s": load.seconds, "vision_s": vision.seconds, "prefill_s": prefill.seconds,
+            "queries_s": queries.seconds, "queries": args.queries, "queries_per_second": per_second,
+            "tokens_per_query": tokens, "tokens_per_second": per_second * tokens as f64,
+            "prompt_tokens": prompt, "gflops": queries.gflops(), "vision_gflops": vision.gflops(),
+            "prefill_gflops": prefill.gflops(), "peak_gflops": peak, "peak_rss_bytes": rss,
+        });
+        println!("{line}");
+        return;
+    }
+    println!("stage     seconds  GFLOP/s  of peak");
+    for (name, stage) in [("vision", vision), ("prefill", prefill), ("queries", queries)] {
+        let share = stage.gflops() / peak * 100.0;
+        println!("{name:9} {:7.3} {:8.0} {share:7.0}%", stage.seconds, stage.gflops());
+    }
+    println!(
+        "{per_second:.1} queries/s, {:.1} tokens/s ({tokens} tokens per query, {prompt} in the shared prefix)",
+        per_second * tokens as f64
+    );
+    println!(
+        "loaded in {:.1} s; peak memory {:.2} GB; registers alone reach {peak:.0} GFLOP/s",
+        load.seconds,
+        rss as f64 * 1e-9
+    );
+}
