@@ -129,6 +129,9 @@ pub struct Fusion {
 }
 
 impl Fusion {
+    /// How far O depends on the input, in pixels: four 3x3 convolutions one after the other.
+    pub const REACH: usize = 4;
+
     /// Reads `sdim.fusion.*`.
     ///
     /// # Errors

@@ -58,6 +58,24 @@ impl KvCache {
         Ok(Tensor::cat(&[old, new], 1)?.reshape(((), width))?)
     }
 
+    /// The cache of these items only, in this order.
+    ///
+    /// # Errors
+    /// [`crate::Error::Tensors`] if an index is out of range.
+    pub fn select(&self, items: &[usize]) -> Result<Self> {
+        let rows = items.iter().flat_map(|&i| (i * self.len..(i + 1) * self.len).map(|r| r as u32));
+        let rows: Vec<u32> = rows.collect();
+        let pick = |t: &Tensor| -> Result<Tensor> {
+            let index = Tensor::from_slice(&rows, rows.len(), t.device())?;
+            Ok(t.index_select(&index, 0)?)
+        };
+        let layers = self.layers.iter().map(|layer| match layer {
+            Some((k, v)) => Ok(Some((pick(k)?, pick(v)?))),
+            None => Ok(None),
+        });
+        Ok(Self { items: items.len(), len: self.len, layers: layers.collect::<Result<_>>()? })
+    }
+
     pub(crate) fn advance(&mut self, tokens: usize) {
         self.len += tokens;
     }
