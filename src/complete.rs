@@ -6,7 +6,7 @@ use crate::error::{Error, Result};
 use crate::model::{LoadOptions, SdimModel};
 use crate::query::plan::{Asked, lattice, refine_pixels, stride_within};
 use crate::query::prompt::choose_evenly;
-use crate::query::{Hint, Prefix, Query, QueryPlan, Reading, ask};
+use crate::query::{AnswerMode, Hint, Prefix, Query, QueryPlan, Reading, ask_as};
 use crate::refine::{Answered, EdgeAwareFill, Fill, FillInput};
 use crate::vlm::preprocess::MAX_RATIO;
 use candle_core::Device;
@@ -62,6 +62,8 @@ pub struct CompleteOptions {
     pub plan: QueryPlan,
     /// What becomes of measured pixels.
     pub preserve: Preserve,
+    /// How answers are got; `None` for the checkpoint's own way (`answer_mode` of `sdim.json`).
+    pub answer: Option<AnswerMode>,
     /// Whether to ask at measured pixels too and to spread the difference over the map, so that it passes through the
     /// measurements.
     pub align: bool,
@@ -78,6 +80,7 @@ impl Default for CompleteOptions {
         Self {
             plan: QueryPlan::default(),
             preserve: Preserve::default(),
+            answer: None,
             align: true,
             fill: Arc::new(EdgeAwareFill::default()),
             progress: None,
@@ -91,6 +94,7 @@ impl std::fmt::Debug for CompleteOptions {
         f.debug_struct("CompleteOptions")
             .field("plan", &self.plan)
             .field("preserve", &self.preserve)
+            .field("answer", &self.answer)
             .field("align", &self.align)
             .finish_non_exhaustive()
     }
@@ -192,7 +196,8 @@ impl DepthCompleter {
     ///
     /// # Errors
     /// [`Error::SizeMismatch`]; [`Error::ImageSize`] on a side under 28 pixels or an aspect ratio over 200;
-    /// [`Error::NoMeasurement`]; [`Error::Cancelled`].
+    /// [`Error::NoMeasurement`]; [`Error::Config`] if the answer mode does not go with the checkpoint or the frame is too small
+    /// for its mark; [`Error::Cancelled`].
     pub fn complete(
         &self,
         rgb: &RgbImage,
@@ -224,16 +229,19 @@ impl DepthCompleter {
             return Err(Error::ImageSize { width: size.0, height: size.1, reason });
         }
         sparse.require_points()?;
+        if let Some(mode) = &options.answer {
+            mode.validate("CompleteOptions", self.model.prompts.settings())?;
+        }
         let mut seconds = StageSeconds::default();
         let _span = tracing::info_span!("complete", width = size.0, height = size.1).entered();
         let span = tracing::info_span!("encode").entered();
         let (pixels, scattered) = self.model.preprocess(rgb, sparse)?;
-        let tokens = self.model.encode(&pixels, &scattered)?;
+        let encoded = self.model.encode_frame(rgb, &pixels, &scattered)?;
         drop(span);
         seconds.encode = start.elapsed().as_secs_f64();
         let span = tracing::info_span!("prefill").entered();
         let mark = Instant::now();
-        let prefix = self.model.read_prefix(&pixels, &tokens, sparse)?;
+        let prefix = self.model.read_encoded(&pixels, encoded, sparse)?;
         drop(span);
         seconds.prefill = mark.elapsed().as_secs_f64();
         let span = tracing::info_span!("queries").entered();
@@ -306,7 +314,8 @@ impl<'a> Frame<'a> {
         planned: usize,
     ) -> Result<Vec<Reading>> {
         let queries: Vec<Query> = pixels.iter().map(|&p| self.query(p, tell)).collect();
-        ask(self.model, self.prefix, &queries, &mut |answered| {
+        let mode = self.options.answer.as_ref().unwrap_or(&self.model.prompts.settings().answer_mode);
+        ask_as(self.model, self.prefix, &queries, mode, &mut |answered| {
             if let Some(callback) = &self.options.progress {
                 callback(Progress { answered: before + answered, planned });
             }

@@ -35,4 +35,4 @@ pub use error::{Error, Result};
 pub use frame::read_rgb;
 pub use kernels::WeightFormat;
 pub use model::{LoadOptions, SdimModel};
-pub use query::QueryPlan;
+pub use query::{AnswerMode, QueryPlan};

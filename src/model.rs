@@ -268,6 +268,16 @@ impl SdimModel {
         normalise: Normalise,
     ) -> Result<Tensor> {
         let grids: Vec<Grid> = frames.iter().map(|p| p.grid).collect();
+        self.vlm.vision.encode(&self.embed_patches(frames, scattered, normalise)?, &grids)
+    }
+
+    /// E of Eq. 3a: embedded patches of frames of one size, `[frames * patches, hidden]`.
+    pub(crate) fn embed_patches(
+        &self,
+        frames: &[&Pixels],
+        scattered: &Tensor,
+        normalise: Normalise,
+    ) -> Result<Tensor> {
         let patches = frames.iter().map(|p| self.preprocessor.patches(p, &self.device));
         let patches = Tensor::cat(&patches.collect::<Result<Vec<_>>>()?, 0)?;
         let mut embedded = self.vlm.vision.patch_embed.forward(&patches)?; // F_e1(I)
@@ -275,14 +285,14 @@ impl SdimModel {
             let images = frames.iter().map(|p| self.preprocessor.image(p, &self.device));
             let rgb = Tensor::stack(&images.collect::<Result<Vec<_>>>()?, 0)?;
             let o = injection.fusion.forward(&rgb, scattered, normalise)?;
-            let tokens = grids.iter().enumerate();
-            let tokens = tokens.map(|(i, &grid)| injection.patch_embed.forward_image(&o.get(i)?, grid));
+            let tokens = frames.iter().enumerate();
+            let tokens = tokens.map(|(i, p)| injection.patch_embed.forward_image(&o.get(i)?, p.grid));
             embedded = kernels::add(&embedded, &Tensor::cat(&tokens.collect::<Result<Vec<_>>>()?, 0)?)?; // Eq. 3a
         }
-        self.vlm.vision.encode(&embedded, &grids)
+        Ok(embedded)
     }
 
-    /// Reads the shared prefix of a frame into a cache.
+    /// Reads the shared prefix of a frame into a cache, for pixel references that leave the image as it is.
     ///
     /// # Errors
     /// [`Error::Tensors`] on mismatched shapes.
@@ -299,7 +309,7 @@ impl SdimModel {
         let embedded = self.add_glimpses(embedded, &[(&image, &tokens.glimpses)])?;
         let mut cache = self.vlm.decoder.cache(1);
         self.vlm.prefill(&embedded, &tokens.positions, &mut cache, Keep::Nothing)?;
-        Ok(Prefix { cache, space, image })
+        Ok(Prefix { cache, ids: tokens.ids, space, image, marked: None })
     }
 }
 

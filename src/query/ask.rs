@@ -1,161 +1,285 @@
 //! Batches of per-pixel suffixes against one shared prefix.
 
+use super::answer::AnswerGrammar;
+use super::generate::{Spoken, Voice};
+use super::marked::MarkedFrame;
+use super::mode::{AnswerMode, Generation};
 use super::number::{DigitReader, NumberFormat, Reading, read_bins_with};
-use super::prompt::{FrameSpace, Glimpse, Query, Tokens};
-use crate::error::Result;
+use super::prefix::Prefix;
+use super::prompt::{Glimpse, Query, Tokens};
+use super::settings::PixelReference;
+use crate::error::{Error, Result};
 use crate::kernels;
 use crate::model::SdimModel;
 use crate::vlm::cache::KvCache;
 use crate::vlm::decoder::{Context, Keep};
 use crate::vlm::rope::Position;
 use candle_core::Tensor;
-use image::RgbImage;
 use rayon::prelude::*;
 use std::collections::BTreeMap;
-use std::sync::Arc;
-
-/// What all queries of a frame share: its keys and values, read once, and its space.
-pub struct Prefix {
-    /// Keys and values of the prefix tokens.
-    pub cache: KvCache,
-    /// Where pixels lie, and what numbers mean.
-    pub space: FrameSpace,
-    /// The resized frame, for the crops around pixels.
-    pub image: Arc<RgbImage>,
-}
 
 /// Rows of one decoder pass, at most: large enough for efficient products, small enough for the caches.
 const ROWS: usize = 4096;
 /// Queries whose prompts are written at a time, so that memory does not grow with their number.
 const CHUNK: usize = 4 * ROWS;
 
-/// Asks all queries and returns one reading each, in metres, in their order.
+/// Asks all queries in the checkpoint's own answer mode and returns one reading each, in metres, in their order.
 ///
 /// Queries do not see each other: the result of each is that of asking it alone. `progress` is called with the number
 /// of answered queries after each batch; it returns false to stop.
 ///
 /// # Errors
-/// [`crate::Error::Cancelled`] if `progress` said so; tensor and tokenizer errors.
+/// [`crate::Error::Cancelled`] if `progress` said so; [`crate::Error::Argument`] if the prefix was not read for the
+/// checkpoint's pixel reference; tensor and tokenizer errors.
 pub fn ask(
     model: &SdimModel,
     prefix: &Prefix,
     queries: &[Query],
     progress: &mut dyn FnMut(usize) -> bool,
 ) -> Result<Vec<Reading>> {
-    let mut readings = Vec::with_capacity(queries.len());
-    for chunk in queries.chunks(CHUNK) {
-        let before = readings.len();
-        readings.extend(ask_chunk(model, prefix, chunk, &mut |done| progress(before + done))?);
-    }
-    Ok(readings)
+    ask_as(model, prefix, queries, &model.prompts.settings().answer_mode, progress)
 }
 
-fn ask_chunk(
+/// As [`ask`], in a given answer mode.
+///
+/// # Errors
+/// As [`ask`], and [`crate::Error::Config`] if the mode does not go with the checkpoint.
+pub fn ask_as(
     model: &SdimModel,
     prefix: &Prefix,
     queries: &[Query],
+    mode: &AnswerMode,
     progress: &mut dyn FnMut(usize) -> bool,
 ) -> Result<Vec<Reading>> {
-    let suffixes: Vec<Tokens> = queries
-        .par_iter()
-        .map(|q| model.prompts.suffix(q, &prefix.space, &model.tokenizer))
-        .collect::<Result<_>>()?;
-    let mut by_length: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
-    for (i, s) in suffixes.iter().enumerate() {
-        by_length.entry(s.len()).or_default().push(i);
+    let unit = prefix.space.unit;
+    match mode {
+        AnswerMode::Digits => {
+            let plan = Plan { forced: true, room: 0 };
+            in_batches(model, prefix, queries, plan, progress, Reading::INVALID, &mut |mut batch| {
+                let readings = forced_numbers(&mut batch)?.into_iter();
+                Ok(readings
+                    .map(|r| Reading { value: r.value * unit, expected_error: r.expected_error * unit, ..r })
+                    .collect())
+            })
+        }
+        AnswerMode::Generate(generation) => {
+            let grammar = AnswerGrammar::new(&model.prompts.settings().template, unit);
+            let spoken = generate(model, prefix, queries, generation, progress)?;
+            spoken.par_iter().map(|s| s.reading(&grammar, &model.tokenizer)).collect()
+        }
     }
-    let mut readings = vec![Reading::INVALID; queries.len()];
+}
+
+/// Lets the model answer each query freely, token by token, and returns what it said, in the order of the queries.
+///
+/// # Errors
+/// As [`ask_as`].
+pub fn generate(
+    model: &SdimModel,
+    prefix: &Prefix,
+    queries: &[Query],
+    generation: &Generation,
+    progress: &mut dyn FnMut(usize) -> bool,
+) -> Result<Vec<Spoken>> {
+    let settings = model.prompts.settings();
+    AnswerMode::Generate(generation.clone()).validate("answer mode", settings)?;
+    let voice = Voice::new(model, generation)?;
+    let plan = Plan { forced: false, room: generation.max_new_tokens };
+    in_batches(model, prefix, queries, plan, progress, Spoken::default(), &mut |mut batch| {
+        voice.speak(&mut batch)
+    })
+}
+
+/// What a batch has to hold.
+#[derive(Clone, Copy)]
+struct Plan {
+    /// Whether the answer's words before the number are part of the suffix.
+    forced: bool,
+    /// Tokens that may follow each suffix.
+    room: usize,
+}
+
+/// Cuts the queries into batches of equally long suffixes, and puts what `answer` makes of them into their order.
+fn in_batches<T: Clone>(
+    model: &SdimModel,
+    prefix: &Prefix,
+    queries: &[Query],
+    plan: Plan,
+    progress: &mut dyn FnMut(usize) -> bool,
+    blank: T,
+    answer: &mut dyn FnMut(Batch) -> Result<Vec<T>>,
+) -> Result<Vec<T>> {
+    let by_marker = matches!(model.prompts.settings().pixel_reference, PixelReference::Marker(_));
+    if by_marker != prefix.marked.is_some() {
+        let found = if by_marker { "a prefix with one image for all" } else { "a prefix of a marked frame" };
+        return Err(Error::argument("prefix", found, "one that SdimModel::read_frame of this model read"));
+    }
+    let mut out = vec![blank; queries.len()];
     let mut done = 0;
-    for (length, members) in by_length {
-        for batch in members.chunks((ROWS / length.max(1)).max(1)) {
-            let answers = ask_batch(model, prefix, &suffixes, batch)?;
-            for (&i, answer) in batch.iter().zip(answers) {
-                readings[i] = Reading {
-                    value: answer.value * prefix.space.unit,
-                    expected_error: answer.expected_error * prefix.space.unit,
-                    ..answer
-                };
-            }
-            done += batch.len();
-            if !progress(done) {
-                return Err(crate::Error::Cancelled);
+    for (start, chunk) in (0..).step_by(CHUNK).zip(queries.chunks(CHUNK)) {
+        let suffixes: Vec<Tokens> = chunk
+            .par_iter()
+            .map(|q| model.prompts.tokens(q, &prefix.space, &model.tokenizer, plan.forced))
+            .collect::<Result<_>>()?;
+        let mut by_length: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
+        for (i, s) in suffixes.iter().enumerate() {
+            by_length.entry(s.len()).or_default().push(i);
+        }
+        for (length, members) in by_length {
+            let rows = match &prefix.marked {
+                None => length + plan.room,
+                Some(marked) => marked.patches().max(marked.opening().len() + length + plan.room),
+            };
+            for batch in members.chunks((ROWS / rows.max(1)).max(1)) {
+                let asked: Vec<&Query> = batch.iter().map(|&i| &chunk[i]).collect();
+                let tokens: Vec<&Tokens> = batch.iter().map(|&i| &suffixes[i]).collect();
+                let answers = answer(Batch::open(model, prefix, &asked, &tokens)?)?;
+                for (&i, a) in batch.iter().zip(answers) {
+                    out[start + i] = a;
+                }
+                done += batch.len();
+                if !progress(done) {
+                    return Err(Error::Cancelled);
+                }
             }
         }
     }
-    Ok(readings)
+    Ok(out)
 }
 
-/// One batch of suffixes of equal length; readings in number units.
-fn ask_batch(
-    model: &SdimModel,
-    prefix: &Prefix,
-    suffixes: &[Tokens],
-    batch: &[usize],
-) -> Result<Vec<Reading>> {
-    let ids: Vec<u32> = batch.iter().flat_map(|&i| suffixes[i].ids.iter().copied()).collect();
-    let positions: Vec<Position> =
-        batch.iter().flat_map(|&i| suffixes[i].positions.iter().copied()).collect();
-    let length = suffixes[batch[0]].len();
-    let glimpses: Vec<Glimpse> = batch
-        .iter()
-        .enumerate()
-        .flat_map(|(n, &i)| {
-            suffixes[i].glimpses.iter().map(move |g| Glimpse { token: n * length + g.token, ..*g })
+/// Suffixes of equal length that are read together and go on together, token by token.
+pub(super) struct Batch<'a> {
+    pub(super) model: &'a SdimModel,
+    prefix: &'a Prefix,
+    own: KvCache,
+    /// Text position of the token that follows each item.
+    next: Vec<f32>,
+    /// All ids of each item, those of the shared prefix first.
+    suffixes: Vec<&'a [u32]>,
+    /// Final hidden state of each item's last token, normed: `[items, hidden]`.
+    pub(super) last: Tensor,
+}
+
+impl<'a> Batch<'a> {
+    /// Reads the suffixes.
+    fn open(
+        model: &'a SdimModel,
+        prefix: &'a Prefix,
+        queries: &[&Query],
+        suffixes: &[&'a Tokens],
+    ) -> Result<Self> {
+        let opening = prefix.marked.as_ref().map(MarkedFrame::opening);
+        let parts = || suffixes.iter().flat_map(|s| opening.into_iter().chain([*s]));
+        let ids: Vec<u32> = parts().flat_map(|t| t.ids.iter().copied()).collect();
+        let positions: Vec<Position> = parts().flat_map(|t| t.positions.iter().copied()).collect();
+        let mut before = 0;
+        let mut glimpses: Vec<Glimpse> = Vec::new();
+        for part in parts() {
+            glimpses.extend(part.glimpses.iter().map(|g| Glimpse { token: before + g.token, ..*g }));
+            before += part.len();
+        }
+        let embedded = match &prefix.marked {
+            None => model.vlm.decoder.embed(&ids)?,
+            Some(marked) => {
+                let pixels: Vec<(usize, usize)> = queries.iter().map(|q| (q.x, q.y)).collect();
+                model.vlm.embed_prompt(&ids, &marked.encode(model, &pixels)?)?
+            }
+        };
+        let mut own = model.vlm.decoder.cache(suffixes.len());
+        let last = read(model, prefix, embedded, &positions, &glimpses, &mut own)?;
+        Ok(Self {
+            model,
+            prefix,
+            own,
+            next: suffixes.iter().map(|s| s.next_text(&prefix.space)).collect(),
+            suffixes: suffixes.iter().map(|s| s.ids.as_slice()).collect(),
+            last,
         })
-        .collect();
-    let mut own = model.vlm.decoder.cache(batch.len());
-    let mut logits = number_logits(model, prefix, &ids, &positions, &glimpses, &mut own)?;
-    match model.prompts.numbers().format {
-        NumberFormat::Bins { range, bins } => {
-            let rows: Vec<f32> = logits.flatten_all()?.to_vec1()?;
-            let rows = rows.par_chunks(bins);
-            Ok(rows.map_init(Vec::new, |scratch, row| read_bins_with(row, range, scratch)).collect())
-        }
-        NumberFormat::Digits { decimals, integers } => {
-            let mut readers = vec![DigitReader::new(decimals, integers); batch.len()];
-            let mut alive = vec![true; batch.len()];
-            let number_ids = &model.prompts.numbers().ids;
-            // Text position of the first digit: one past the last text token of each suffix.
-            let mut next: Vec<f32> = batch.iter().map(|&i| suffixes[i].next_text(&prefix.space)).collect();
-            loop {
-                let rows: Vec<f32> = logits.flatten_all()?.to_vec1()?;
-                let mut ids = vec![number_ids[0]; batch.len()];
-                let mut open = false;
-                for (i, row) in rows.chunks(11).enumerate() {
-                    if alive[i] {
-                        match readers[i].push(row) {
-                            Some(digit) => ids[i] = number_ids[digit],
-                            None => alive[i] = false,
-                        }
-                        alive[i] &= !readers[i].done();
-                        open |= alive[i];
-                    }
-                }
-                if !open {
-                    return Ok(readers.iter().map(DigitReader::reading).collect());
-                }
-                let positions: Vec<Position> = next.iter().map(|&p| Position::text(p)).collect();
-                next.iter_mut().for_each(|p| *p += 1.0);
-                logits = number_logits(model, prefix, &ids, &positions, &[], &mut own)?;
-            }
-        }
+    }
+
+    /// Sequences in it.
+    pub(super) fn items(&self) -> usize {
+        self.own.items()
+    }
+
+    /// Ids that an item has read, image placeholders included.
+    pub(super) fn prompt(&self, item: usize) -> impl Iterator<Item = u32> + '_ {
+        let opening = self.prefix.marked.iter().flat_map(|m| m.opening().ids.iter());
+        self.prefix.ids.iter().chain(opening).chain(self.suffixes[item]).copied()
+    }
+
+    /// Reads one more text token per item.
+    pub(super) fn go_on(&mut self, ids: &[u32]) -> Result<()> {
+        let positions: Vec<Position> = self.next.iter().map(|&p| Position::text(p)).collect();
+        self.next.iter_mut().for_each(|p| *p += 1.0);
+        let embedded = self.model.vlm.decoder.embed(ids)?;
+        self.last = read(self.model, self.prefix, embedded, &positions, &[], &mut self.own)?;
+        Ok(())
+    }
+
+    /// Goes on with these items only, in this order.
+    pub(super) fn keep(&mut self, items: &[usize]) -> Result<()> {
+        self.own = self.own.select(items)?;
+        self.next = items.iter().map(|&i| self.next[i]).collect();
+        self.suffixes = items.iter().map(|&i| self.suffixes[i]).collect();
+        Ok(())
+    }
+
+    /// The number rows of the output head, `[items, numbers]`.
+    fn number_logits(&self) -> Result<Vec<f32>> {
+        let logits = kernels::linear(&self.last, &self.model.number_rows, None)?;
+        Ok(logits.flatten_all()?.to_vec1()?)
     }
 }
 
-/// Reads one more run of tokens per item and returns the number rows of the output head at each item's last token,
-/// `[items, numbers]`.
-fn number_logits(
+/// The number that each item is made to say, in number units: its words are forced, its tokens chosen among numbers.
+fn forced_numbers(batch: &mut Batch) -> Result<Vec<Reading>> {
+    let numbers = batch.model.prompts.numbers();
+    let (decimals, integers) = match numbers.format {
+        NumberFormat::Bins { range, bins } => {
+            let rows = batch.number_logits()?;
+            let rows = rows.par_chunks(bins);
+            return Ok(rows.map_init(Vec::new, |scratch, row| read_bins_with(row, range, scratch)).collect());
+        }
+        NumberFormat::Digits { decimals, integers } => (decimals, integers),
+    };
+    let mut readers = vec![DigitReader::new(decimals, integers); batch.items()];
+    let mut alive = vec![true; batch.items()];
+    loop {
+        let rows = batch.number_logits()?;
+        let mut ids = vec![numbers.ids[0]; batch.items()];
+        let mut open = false;
+        for (i, row) in rows.chunks(numbers.ids.len()).enumerate() {
+            if alive[i] {
+                match readers[i].push(row) {
+                    Some(digit) => ids[i] = numbers.ids[digit],
+                    None => alive[i] = false,
+                }
+                alive[i] &= !readers[i].done();
+                open |= alive[i];
+            }
+        }
+        if !open {
+            return Ok(readers.iter().map(DigitReader::reading).collect());
+        }
+        batch.go_on(&ids)?;
+    }
+}
+
+/// Reads one more run of embedded tokens per item and returns the normed hidden state of each item's last token,
+/// `[items, hidden]`.
+fn read(
     model: &SdimModel,
     prefix: &Prefix,
-    ids: &[u32],
+    embedded: Tensor,
     positions: &[Position],
     glimpses: &[Glimpse],
     own: &mut KvCache,
 ) -> Result<Tensor> {
     let decoder = &model.vlm.decoder;
-    let embedded = model.add_glimpses(decoder.embed(ids)?, &[(&prefix.image, glimpses)])?;
+    let embedded = model.add_glimpses(embedded, &[(&prefix.image, glimpses)])?;
     let table = decoder.rope().table(positions, embedded.device())?;
     let context = Context::Cached { shared: Some(&prefix.cache), own };
     let last = decoder.forward_keeping(&embedded, &table, context, Keep::Last)?;
-    kernels::linear(&decoder.final_norm(&last)?, &model.number_rows, None)
+    decoder.final_norm(&last)
 }

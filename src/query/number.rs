@@ -10,8 +10,24 @@ use crate::vlm::tokenizer::Tokenizer;
 pub enum DepthUnit {
     /// One metre.
     Metres,
+    /// A hundredth of a metre.
+    Centimetres,
+    /// A thousandth of a metre.
+    Millimetres,
     /// The frame's largest measurement.
     FrameMax,
+}
+
+impl DepthUnit {
+    /// Metres of the number 1 in a frame whose largest measurement is `largest` metres.
+    pub fn metres(self, largest: f32) -> f32 {
+        match self {
+            Self::Metres => 1.0,
+            Self::Centimetres => 0.01,
+            Self::Millimetres => 0.001,
+            Self::FrameMax => largest,
+        }
+    }
 }
 
 /// How a number is written, a property of the checkpoint.
@@ -63,7 +79,7 @@ impl Reading {
 }
 
 /// Half-width of the interval whose probability is the confidence, relative to the answer.
-const CONFIDENT_WITHIN: f32 = 0.05;
+pub(super) const CONFIDENT_WITHIN: f32 = 0.05;
 
 impl NumberFormat {
     /// Checks the sizes of a configuration.

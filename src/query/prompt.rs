@@ -1,6 +1,6 @@
 //! From a frame to tokens: the shared prefix, and one suffix per asked pixel.
 
-use super::number::{DepthUnit, Numbers};
+use super::number::{NumberFormat, Numbers};
 use super::settings::{MeasurementPrompt, PixelReference, Settings};
 use crate::depth::SparseDepth;
 use crate::error::{Error, Result};
@@ -35,6 +35,18 @@ pub struct Glimpse {
 }
 
 impl Tokens {
+    /// Cuts off what stands before the image: the tokens before index `at` and those from it on.
+    pub(crate) fn split(mut self, at: usize) -> (Self, Self) {
+        let mut rest = Self {
+            ids: self.ids.split_off(at),
+            positions: self.positions.split_off(at),
+            glimpses: self.glimpses.iter().filter(|g| g.token >= at).copied().collect(),
+        };
+        rest.glimpses.iter_mut().for_each(|g| g.token -= at);
+        self.glimpses.retain(|g| g.token < at);
+        (self, rest)
+    }
+
     fn push(&mut self, id: u32, position: Position) {
         self.ids.push(id);
         self.positions.push(position);
@@ -152,7 +164,7 @@ impl PromptWriter {
         let t = &settings.template;
         let pointer = match &settings.pixel_reference {
             PixelReference::Pointer { token } => Some(tokenizer.id(token)?),
-            PixelReference::Coordinates => None,
+            PixelReference::Coordinates | PixelReference::Marker(_) => None,
         };
         let mut writer = Self {
             numbers: Numbers::new(settings.number, tokenizer)?,
@@ -171,14 +183,14 @@ impl PromptWriter {
     /// encoded with them, since a tokenizer may join across the seam.
     fn split(&self, tokenizer: &Tokenizer) -> Result<Vec<Piece>> {
         let query = &self.settings.template.query;
-        let words = self.pointer.is_none() || query.contains("{mask}");
-        let (left, right) = query.split_once("{pixel}").unwrap_or((query.as_str(), ""));
+        let words = self.settings.pixel_reference == PixelReference::Coordinates || query.contains("{mask}");
         let piece = |text: &str| -> Result<Piece> {
             Ok(if words { Piece::Words(text.to_string()) } else { Piece::Text(tokenizer.encode(text)?) })
         };
         if self.pointer.is_none() {
-            return Ok(vec![Piece::Words(query.clone())]);
+            return Ok(vec![piece(query)?]);
         }
+        let (left, right) = query.split_once("{pixel}").unwrap_or((query.as_str(), ""));
         Ok(vec![piece(left)?, Piece::Pointer, piece(right)?])
     }
 
@@ -194,10 +206,7 @@ impl PromptWriter {
 
     /// Metres per number unit of a frame.
     pub fn unit(&self, sparse: &SparseDepth) -> f32 {
-        match self.settings.unit {
-            DepthUnit::Metres => 1.0,
-            DepthUnit::FrameMax => sparse.max().unwrap_or(1.0),
-        }
+        self.settings.unit.metres(sparse.max().unwrap_or(1.0))
     }
 
     /// The shared prefix: text, image placeholders, text, measurements; and the frame's space.
@@ -258,6 +267,17 @@ impl PromptWriter {
     /// # Errors
     /// [`crate::Error::Tokenizer`] if the text cannot be encoded.
     pub fn suffix(&self, query: &Query, space: &FrameSpace, tokenizer: &Tokenizer) -> Result<Tokens> {
+        self.tokens(query, space, tokenizer, true)
+    }
+
+    /// The suffix of one query, with or without the forced words of the answer.
+    pub(super) fn tokens(
+        &self,
+        query: &Query,
+        space: &FrameSpace,
+        tokenizer: &Tokenizer,
+        forced: bool,
+    ) -> Result<Tokens> {
         let mut out = Tokens::default();
         let mut p = space.next;
         let mut text = |out: &mut Tokens, ids: &[u32]| {
@@ -281,7 +301,9 @@ impl PromptWriter {
                 }
             }
         }
-        text(&mut out, &self.forced);
+        if forced {
+            text(&mut out, &self.forced);
+        }
         if out.is_empty() {
             return Err(Error::config(
                 "sdim.json",
@@ -297,7 +319,12 @@ impl PromptWriter {
         let t = &self.settings.template;
         let mask = match (self.settings.measurements, query.measured) {
             (MeasurementPrompt::PerQuery, Some(depth)) => {
-                t.mask_measured.replace("{x}", &format!("{:.3}", depth / space.unit))
+                // As many decimals as the answer has.
+                let decimals = match self.numbers.format {
+                    NumberFormat::Digits { decimals, .. } => decimals,
+                    NumberFormat::Bins { .. } => 3,
+                };
+                t.mask_measured.replace("{x}", &format!("{:.decimals$}", depth / space.unit))
             }
             _ => t.mask_missing.clone(),
         };

@@ -1,11 +1,14 @@
 //! `sdim.json`: what is ours about a checkpoint, beside the published `config.json`.
 
+use super::marker::Marker;
+use super::mode::{AnswerMode, Generation};
 use super::number::{DepthUnit, NumberFormat};
 use super::template::PromptTemplate;
 use crate::error::{Error, Result};
 use crate::fusion::FusionConfig;
 use crate::vlm::lora::{LoraConfig, LoraMode, LoraSet};
 use crate::vlm::rope::RopeLayout;
+use serde_json::Value;
 
 /// The format version that this crate writes and reads.
 pub const FORMAT: u32 = 1;
@@ -21,6 +24,8 @@ pub enum PixelReference {
     },
     /// The pixel's column and row in words, in pixels of the resized image.
     Coordinates,
+    /// A mark drawn into the image, which is encoded anew for each query: slow, for checkpoints of DepthLM's kind.
+    Marker(Marker),
 }
 
 /// Where the measurements are told.
@@ -77,6 +82,9 @@ pub struct Settings {
     pub number: NumberFormat,
     /// What the number 1 means.
     pub unit: DepthUnit,
+    /// How an answer is got.
+    #[serde(default)]
+    pub answer_mode: AnswerMode,
     /// Channels of the fusion block; `null` for a checkpoint without one.
     #[serde(default)]
     pub fusion: Option<FusionConfig>,
@@ -87,6 +95,18 @@ pub struct Settings {
 
 fn one() -> f32 {
     1.0
+}
+
+/// The keys of a part of `sdim.json`.
+fn json(part: &impl serde::Serialize) -> serde_json::Result<serde_json::Map<String, Value>> {
+    match serde_json::to_value(part)? {
+        Value::Object(keys) => Ok(keys),
+        _ => Ok(serde_json::Map::new()),
+    }
+}
+
+fn unknown(file: &str, key: &str, found: &str) -> Error {
+    Error::config(file, key, found, format!("one of the presets {}", PromptTemplate::PRESETS.join(", ")))
 }
 
 impl Settings {
@@ -103,8 +123,37 @@ impl Settings {
             glimpse: None,
             number: NumberFormat::Digits { decimals: 3, integers: 3 },
             unit: DepthUnit::Metres,
+            answer_mode: AnswerMode::Digits,
             fusion: None,
             lora: None,
+        }
+    }
+
+    /// DepthLM's way of asking, for a checkpoint that was trained as DepthLM trains Qwen2.5-VL: a mark in the image, its
+    /// question, free answers. It neither sees nor is told measurements; they come in by the alignment of the map.
+    pub fn depthlm() -> Self {
+        Self {
+            template: PromptTemplate::depthlm(),
+            pixel_reference: PixelReference::Marker(Marker::default()),
+            measurements: MeasurementPrompt::None,
+            number: NumberFormat::Digits { decimals: 2, integers: 3 },
+            answer_mode: AnswerMode::Generate(Generation { max_new_tokens: 128, ..Generation::default() }),
+            ..Self::paper()
+        }
+    }
+
+    /// All settings of a preset by its name; `None` if there is none of it.
+    pub fn preset(name: &str) -> Option<Self> {
+        match name {
+            "paper" => Some(Self::paper()),
+            "paper_marked" => Some(Self {
+                template: PromptTemplate::paper_marked(),
+                pixel_reference: PixelReference::Marker(Marker::default()),
+                ..Self::paper()
+            }),
+            "depthlm" => Some(Self::depthlm()),
+            "tiny" => Some(Self::tiny()),
+            _ => None,
         }
     }
 
@@ -121,19 +170,43 @@ impl Settings {
             glimpse: Some(8),
             number: NumberFormat::Bins { bins: 1000, range: 1.25 },
             unit: DepthUnit::FrameMax,
+            answer_mode: AnswerMode::Digits,
             fusion: Some(FusionConfig { branch: 16, high: 32, low: 16 }),
             lora: None,
         }
     }
 
-    /// Parses `sdim.json`.
+    /// Parses `sdim.json`. It spells all keys out, or names a `preset` for those that it leaves out; `template` may be the
+    /// name of a preset, too.
     ///
     /// # Errors
-    /// [`Error::Format`] if it is no such file, [`Error::Config`] on an unknown format version or a value out of range.
+    /// [`Error::Format`] if it is no such file, [`Error::Config`] on an unknown format version or preset or a value out of
+    /// range.
     pub fn from_bytes(file: &std::path::Path, bytes: &[u8]) -> Result<Self> {
-        let settings: Self = serde_json::from_slice(bytes)
-            .map_err(|e| Error::format(file, e.to_string(), "the keys of sdim.json"))?;
-        settings.validate(&file.display().to_string())?;
+        let wrong = |e: serde_json::Error| Error::format(file, e.to_string(), "the keys of sdim.json");
+        let name = file.display().to_string();
+        let mut keys: serde_json::Map<String, Value> = serde_json::from_slice(bytes).map_err(wrong)?;
+        let mut short = false;
+        if let Some(Value::String(preset)) = keys.get("template") {
+            let template =
+                PromptTemplate::preset(preset).ok_or_else(|| unknown(&name, "template", preset))?;
+            keys.insert("template".into(), Value::Object(json(&template).map_err(wrong)?));
+            short = true;
+        }
+        if let Some(preset) = keys.remove("preset") {
+            let found = preset.as_str().and_then(Self::preset);
+            let found = found.ok_or_else(|| unknown(&name, "preset", &preset.to_string()))?;
+            let own = std::mem::replace(&mut keys, json(&found).map_err(wrong)?);
+            keys.extend(own);
+            short = true;
+        }
+        let settings: Self = match short {
+            true => serde_json::from_value(Value::Object(keys)),
+            // From the text itself, so that messages give the line.
+            false => serde_json::from_slice(bytes),
+        }
+        .map_err(wrong)?;
+        settings.validate(&name)?;
         Ok(settings)
     }
 
@@ -187,6 +260,126 @@ impl Settings {
             lora.validate(file)?;
         }
         self.template.validate(file)?;
-        self.number.validate(file)
+        self.number.validate(file)?;
+        self.validate_reference(file)?;
+        self.answer_mode.validate(file, self)
+    }
+
+    fn validate_reference(&self, file: &str) -> Result<()> {
+        let query = &self.template.query;
+        let (wanted, why) = match &self.pixel_reference {
+            PixelReference::Marker(marker) => {
+                marker.validate(file)?;
+                (false, "no `{pixel}`, since the mark in the image says which pixel is meant")
+            }
+            _ => (true, "`{pixel}` once"),
+        };
+        if query.contains("{pixel}") != wanted {
+            return Err(Error::config(file, "template.query", format!("{query:?}"), why));
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::path::Path;
+
+    fn parse(text: &str) -> Result<Settings> {
+        Settings::from_bytes(Path::new("dir/sdim.json"), text.as_bytes())
+    }
+
+    fn with(change: impl FnOnce(&mut Value), settings: Settings) -> Result<Settings> {
+        let mut json = serde_json::to_value(settings).unwrap();
+        change(&mut json);
+        parse(&json.to_string())
+    }
+
+    #[test]
+    fn presets_round_trip_and_files_of_the_first_format_are_read_as_they_are() {
+        for name in PromptTemplate::PRESETS {
+            let settings = Settings::preset(name).unwrap();
+            assert_eq!(settings.template, PromptTemplate::preset(name).unwrap());
+            assert_eq!(with(|_| {}, settings.clone()).unwrap(), settings, "{name}");
+            assert_eq!(parse(&format!("{{\"preset\": {name:?}}}")).unwrap(), settings, "{name}");
+        }
+        let shipped = include_str!("../../assets/sdim-tiny/sdim.json");
+        assert!(!shipped.contains("answer_mode"));
+        assert_eq!(parse(shipped).unwrap(), Settings::tiny());
+        let old = with(|j| drop(j.as_object_mut().unwrap().remove("answer_mode")), Settings::paper());
+        assert_eq!(old.unwrap(), Settings::paper());
+    }
+
+    #[test]
+    fn a_file_may_name_presets_and_change_them() {
+        let settings = parse(
+            r#"{"format": 1, "preset": "depthlm", "unit": "metres",
+                "pixel_reference": {"kind": "marker", "shape": "cross", "size": 9},
+                "answer_mode": {"kind": "generate", "max_new_tokens": 20}}"#,
+        );
+        let marker = Marker { shape: super::super::MarkerShape::Cross, size: 9, colour: [255, 0, 0] };
+        let mode = AnswerMode::Generate(Generation { max_new_tokens: 20, ..Generation::default() });
+        let want = Settings {
+            pixel_reference: PixelReference::Marker(marker),
+            answer_mode: mode,
+            ..Settings::depthlm()
+        };
+        assert_eq!(settings.unwrap(), want);
+        let named = with(|j| j["template"] = "paper".into(), Settings::paper());
+        assert_eq!(named.unwrap(), Settings::paper());
+        let both = parse(r#"{"preset": "depthlm", "template": "paper_marked"}"#).unwrap();
+        assert_eq!(both.template, PromptTemplate::paper_marked());
+    }
+
+    #[test]
+    fn what_is_wrong_is_named() {
+        type Change = fn(&mut Value);
+        let cases: [(Settings, Change, &str); 14] = [
+            (Settings::paper(), |j| j["template"] = "papers".into(), "template"),
+            (Settings::paper(), |j| j["preset"] = "qwen".into(), "preset"),
+            (Settings::paper(), |j| j["preset"] = 7.into(), "preset"),
+            (Settings::depthlm(), |j| j["pixel_reference"]["size"] = 0.into(), "pixel_reference.size"),
+            (Settings::depthlm(), |j| j["pixel_reference"]["size"] = 100_000.into(), "pixel_reference.size"),
+            (Settings::depthlm(), |j| j["template"] = "paper".into(), "template.query"),
+            (Settings::paper(), |j| j["template"] = "depthlm".into(), "template.query"),
+            (
+                Settings::depthlm(),
+                |j| j["answer_mode"]["max_new_tokens"] = 0.into(),
+                "answer_mode.max_new_tokens",
+            ),
+            (
+                Settings::depthlm(),
+                |j| j["answer_mode"]["max_new_tokens"] = 5000.into(),
+                "answer_mode.max_new_tokens",
+            ),
+            (
+                Settings::depthlm(),
+                |j| j["answer_mode"]["repetition_penalty"] = (-1.0).into(),
+                "answer_mode.repetition_penalty",
+            ),
+            (Settings::depthlm(), |j| j["answer_mode"]["stop"] = Value::Array(vec![]), "answer_mode.stop"),
+            (Settings::tiny(), |j| j["answer_mode"]["kind"] = "generate".into(), "answer_mode.kind"),
+            (Settings::depthlm(), |j| j["unit"] = "frame_max".into(), "unit"),
+            (Settings::depthlm(), |j| j["unit"] = "millimetres".into(), "unit"),
+        ];
+        for (settings, change, wanted) in cases {
+            match with(change, settings) {
+                Err(Error::Config { file, key, .. }) => {
+                    assert_eq!((file.as_str(), key.as_str()), ("dir/sdim.json", wanted))
+                }
+                other => panic!("{wanted}: {other:?}"),
+            }
+        }
+        for change in [
+            (|j| j["pixel_reference"]["colour"] = serde_json::json!([256, 0, 0])) as Change,
+            |j| j["pixel_reference"]["shape"] = "star".into(),
+            |j| j["answer_mode"]["kind"] = "guess".into(),
+            |j| j["answer_mode"]["max_new_tokens"] = (-1).into(),
+            |j| j["template"] = 5.into(),
+        ] {
+            let error = with(change, Settings::depthlm()).unwrap_err();
+            assert!(matches!(error, Error::Format { .. }), "{error}");
+        }
     }
 }

@@ -1,5 +1,6 @@
 //! The words of the prompt and of the answer.
 
+use super::answer::split_unit;
 use crate::error::{Error, Result};
 
 /// The paper's question Q (Sec. 3.3).
@@ -14,11 +15,25 @@ pub const ANSWER: &str = "The current pixel is {y} meters away from the camera."
 /// The paper's supervision text (Sec. 3.4), which differs from the answer by one word; `{y}` is the depth.
 pub const SUPERVISION: &str = "The pixel is {y} meters away from the camera.";
 
+/// DepthLM's question. Source: arXiv 2509.25413 and its published code (github.com/facebookresearch/DepthLM_Official,
+/// `utils/datasets.py` at 13cebf4), which says that the method does not hang on these words.
+pub const DEPTHLM_QUESTION: &str = "Given this image, how far is the point pointed by the red arrow from the camera? Output the \
+thinking process in <think> </think> and final answer (the meter number only, without the unit) in <answer> </answer> tags.";
+/// What DepthLM is trained to think before it repeats the number as `<answer> {y} </answer>`; same source.
+pub const DEPTHLM_THOUGHT: &str = "<think> The point is around {y} meters away from the camera. </think>";
+
+/// Qwen2.5-VL's chat frame before the image, with its default system turn.
+const CHAT_BEFORE: &str =
+    "<|im_start|>system\nYou are a helpful assistant.<|im_end|>\n<|im_start|>user\n<|vision_start|>";
+/// The same between the question and the answer.
+const CHAT_AFTER: &str = "<|im_end|>\n<|im_start|>assistant\n";
+
 /// The prompt's text, a property of the checkpoint.
 ///
 /// Everything up to and including `after_image` is shared by all pixels and read once; `query` is read per pixel.
-/// In `query`, `{pixel}` stands for the pixel reference, `{mask}` for the mask sentence where measurements are given per
-/// query. In `answer`, `{y}` stands for the number.
+/// In `query`, `{pixel}` stands for the pixel reference (unless that is a mark in the image), `{mask}` for the mask sentence
+/// where measurements are given per query. In `answer`, `{y}` stands for the number. `sdim.json` may give a preset's name
+/// instead of the texts.
 #[derive(Debug, Clone, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 pub struct PromptTemplate {
     /// Before the image tokens.
@@ -38,16 +53,48 @@ pub struct PromptTemplate {
 }
 
 impl PromptTemplate {
-    /// The paper's sentences in Qwen's chat frame.
+    /// Names of the presets.
+    pub const PRESETS: [&str; 4] = ["paper", "paper_marked", "depthlm", "tiny"];
+
+    /// A preset by its name; `None` if there is none of it.
+    pub fn preset(name: &str) -> Option<Self> {
+        match name {
+            "paper" => Some(Self::paper()),
+            "paper_marked" => Some(Self::paper_marked()),
+            "depthlm" => Some(Self::depthlm()),
+            "tiny" => Some(Self::tiny()),
+            _ => None,
+        }
+    }
+
+    /// The paper's sentences in Qwen's chat frame, the pixel in words: first the text made of the measurement (T of Eq. 4),
+    /// then the question Q.
     pub fn paper() -> Self {
+        Self { query: format!("{{mask}} {QUESTION} {{pixel}}{CHAT_AFTER}"), ..Self::paper_marked() }
+    }
+
+    /// The paper's sentences for a pixel that is marked in the image. The paper points at its reference pixel "\[5\]", that
+    /// is as DepthLM does.
+    pub fn paper_marked() -> Self {
         Self {
-            before_image: "<|im_start|>system\nYou are a helpful assistant.<|im_end|>\n<|im_start|>user\n<|vision_start|>".into(),
+            before_image: CHAT_BEFORE.into(),
             after_image: "<|vision_end|>".into(),
-            query: format!("{{mask}} {QUESTION} {{pixel}}<|im_end|>\n<|im_start|>assistant\n"),
+            query: format!("{{mask}} {QUESTION}{CHAT_AFTER}"),
             mask_missing: MASK_MISSING.into(),
             mask_measured: MASK_MEASURED.into(),
             coordinates: "The current pixel is at ({col}, {row}).".into(),
             answer: ANSWER.into(),
+        }
+    }
+
+    /// DepthLM's question and thought in Qwen's chat frame. It is not told measurements.
+    pub fn depthlm() -> Self {
+        Self {
+            query: format!("{DEPTHLM_QUESTION}{CHAT_AFTER}"),
+            mask_missing: String::new(),
+            mask_measured: String::new(),
+            answer: DEPTHLM_THOUGHT.into(),
+            ..Self::paper_marked()
         }
     }
 
@@ -76,7 +123,7 @@ impl PromptTemplate {
             let expected = format!("`{part}` {} to {} times", times.start(), times.end());
             Err(Error::config(file, key, format!("{text:?}"), expected))
         };
-        need("template.query", &self.query, "{pixel}", 1..=1)?;
+        need("template.query", &self.query, "{pixel}", 0..=1)?;
         need("template.query", &self.query, "{mask}", 0..=1)?;
         need("template.answer", &self.answer, "{y}", 1..=1)?;
         for part in ["{col}", "{row}"] {
@@ -86,6 +133,12 @@ impl PromptTemplate {
             need("template.mask_measured", &self.mask_measured, "{x}", 1..=1)?;
         }
         Ok(())
+    }
+
+    /// Metres of the unit that follows the number in the answer; `None` if no unit of length does.
+    pub fn answer_unit(&self) -> Option<f64> {
+        let (_, after) = self.answer.split_once("{y}")?;
+        split_unit(after).map(|(metres, _)| metres)
     }
 
     /// The answer's words before the number.
@@ -107,7 +160,37 @@ mod tests {
             "The mask value is 1, and the distance to the camera is 4.230 meters, preserve the given value."
         );
         assert!(t.query.contains("What is the distance from the current pixel to the camera?"));
-        assert!(t.validate("t").is_ok() && PromptTemplate::tiny().validate("t").is_ok());
+        assert_eq!(
+            t.query.replace("{mask}", &t.mask_missing).split_once("<|im_end|>").map(|p| p.0),
+            Some(
+                "The mask value is 0; predict the distance to the camera. \
+                 What is the distance from the current pixel to the camera? {pixel}"
+            )
+        );
+        assert_eq!(
+            t.answer.replace("{y}", "4.230"),
+            "The current pixel is 4.230 meters away from the camera."
+        );
+        assert_eq!(SUPERVISION.replace("{y}", "1"), "The pixel is 1 meters away from the camera.");
+    }
+
+    #[test]
+    fn presets_are_found_by_name_and_hold_what_a_template_needs() {
+        for name in PromptTemplate::PRESETS {
+            PromptTemplate::preset(name).unwrap().validate("t").unwrap();
+        }
+        assert_eq!(PromptTemplate::preset("Paper"), None);
+        assert_eq!(PromptTemplate::preset("depthlm"), Some(PromptTemplate::depthlm()));
+    }
+
+    #[test]
+    fn the_unit_of_an_answer_is_the_word_after_its_number() {
+        let unit =
+            |answer: &str| PromptTemplate { answer: answer.into(), ..PromptTemplate::tiny() }.answer_unit();
+        assert_eq!(PromptTemplate::paper().answer_unit(), Some(1.0));
+        assert_eq!(PromptTemplate::depthlm().answer_unit(), Some(1.0));
+        assert_eq!(unit("it is {y}mm away"), Some(0.001));
+        assert_eq!((unit("{y}"), unit("{y} miles"), unit("<answer> {y} </answer>")), (None, None, None));
     }
 
     #[test]

@@ -9,9 +9,9 @@ use crate::error::{Error, Result};
 use crate::fusion::{BatchStats, Normalise};
 use crate::kernels::{self, Block};
 use crate::model::SdimModel;
-use crate::query::Settings;
 use crate::query::number::{NumberFormat, POINT};
 use crate::query::prompt::Glimpse;
+use crate::query::{PixelReference, Settings};
 use crate::vlm::decoder::Context;
 use crate::vlm::preprocess::Pixels;
 use crate::vlm::rope::Position;
@@ -93,6 +93,11 @@ impl Trainer {
         let b = &config.batch;
         if config.steps == 0 || b.frames == 0 || b.questions == 0 || b.sizes.is_empty() {
             return Err(Error::argument("train config", format!("{config:?}"), "at least one of everything"));
+        }
+        if let PixelReference::Marker(_) = settings.pixel_reference {
+            let expected =
+                "a pixel reference that leaves the image as it is: batches share it between questions";
+            return Err(Error::argument("pixel_reference", "marker", expected));
         }
         let files = FreshFiles::tiny(settings)?;
         let empty = Weights::from_tensors("fresh", Default::default());

@@ -1,0 +1,87 @@
+//! Answer modes: forced words around a constrained number, or free speech that is read afterwards.
+
+use super::number::{DepthUnit, NumberFormat};
+use super::settings::Settings;
+use crate::error::{Error, Result};
+
+/// How an answer is got.
+#[derive(Debug, Clone, PartialEq, Default, serde::Serialize, serde::Deserialize)]
+#[serde(tag = "kind", rename_all = "snake_case")]
+pub enum AnswerMode {
+    /// The answer's words are forced, and its number is chosen among numbers: always readable, and the fewest passes.
+    #[default]
+    Digits,
+    /// The model speaks freely, and what it says is read by [`super::AnswerGrammar`].
+    Generate(Generation),
+}
+
+/// How the model speaks freely: greedily, and not without end.
+#[derive(Debug, Clone, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(default)]
+pub struct Generation {
+    /// Tokens of an answer, at most.
+    pub max_new_tokens: usize,
+    /// Divides the logits of all tokens seen so far (multiplies those below 0); 1 is none. The published generation config of
+    /// Qwen2.5-VL has 1.05, which pulls away from the very digits that a prompt states, so it is off here.
+    pub repetition_penalty: f32,
+    /// Tokens that end an answer. The two of Qwen2.5-VL's published generation config, unless said otherwise.
+    pub stop: Vec<String>,
+}
+
+impl Default for Generation {
+    fn default() -> Self {
+        Self {
+            max_new_tokens: 64,
+            repetition_penalty: 1.0,
+            stop: vec!["<|im_end|>".into(), "<|endoftext|>".into()],
+        }
+    }
+}
+
+/// Tokens of an answer, at most that can be asked for: DepthLM's own evaluation uses as many.
+const MAX_NEW_TOKENS: usize = 4096;
+
+impl AnswerMode {
+    /// Checks the mode by itself and against the rest of the settings.
+    ///
+    /// # Errors
+    /// [`Error::Config`] names the field.
+    pub fn validate(&self, file: &str, settings: &Settings) -> Result<()> {
+        let Self::Generate(g) = self else { return Ok(()) };
+        let check = |ok: bool, key: &str, found: String, expected: &str| {
+            if ok { Ok(()) } else { Err(Error::config(file, key, found, expected)) }
+        };
+        check(
+            (1..=MAX_NEW_TOKENS).contains(&g.max_new_tokens),
+            "answer_mode.max_new_tokens",
+            g.max_new_tokens.to_string(),
+            "1 to 4096 tokens",
+        )?;
+        check(
+            g.repetition_penalty.is_finite() && g.repetition_penalty > 0.0,
+            "answer_mode.repetition_penalty",
+            g.repetition_penalty.to_string(),
+            "a positive number; 1 for none",
+        )?;
+        check(!g.stop.is_empty(), "answer_mode.stop", "[]".into(), "at least one token")?;
+        check(
+            matches!(settings.number, NumberFormat::Digits { .. }),
+            "answer_mode.kind",
+            "\"generate\", but number.kind is \"bins\"".into(),
+            "number.kind \"digits\", since only digits can be read from words",
+        )?;
+        let named = settings.template.answer_unit();
+        let counted = match settings.unit {
+            DepthUnit::FrameMax => None,
+            unit => Some(f64::from(unit.metres(1.0))),
+        };
+        // A sentence in metres around a number that counts something else would be read as metres.
+        let agree = named.is_none_or(|n| counted.is_some_and(|c| (c - n).abs() < 1e-6));
+        check(
+            agree,
+            "unit",
+            format!("{:?}, but the answer is {:?}", settings.unit, settings.template.answer),
+            "the unit that the answer names",
+        )
+    }
+}
