@@ -11,6 +11,7 @@ use crate::vlm::QwenVl;
 use crate::vlm::checkpoint::{CONFIG, PREPROCESSOR, Source, TOKENIZER, check_patches};
 use crate::vlm::config::VlmConfig;
 use crate::vlm::decoder::Keep;
+use crate::vlm::generate::GenerationConfig;
 use crate::vlm::grid::Grid;
 use crate::vlm::linear::Linear;
 use crate::vlm::lora::LoraMode;
@@ -46,6 +47,8 @@ pub struct SdimModel {
     pub prompts: PromptWriter,
     /// Its vocabulary.
     pub tokenizer: Tokenizer,
+    /// Ids that end a free answer.
+    pub stop_ids: Vec<u32>,
     /// Rows of the output head that can continue a number, `[numbers, hidden]`.
     pub number_rows: Tensor,
     /// Where its tensors are.
@@ -62,6 +65,8 @@ pub struct CheckpointFiles {
     pub settings: Settings,
     /// `tokenizer.json`
     pub tokenizer: Tokenizer,
+    /// Ids that end an answer, of `generation_config.json` or `config.json`.
+    pub stop_ids: Vec<u32>,
 }
 
 impl CheckpointFiles {
@@ -99,6 +104,7 @@ impl CheckpointFiles {
                 Settings::paper()
             },
             tokenizer: source.tokenizer()?,
+            stop_ids: GenerationConfig::read(source)?.stop_ids,
         })
     }
 }
@@ -171,7 +177,7 @@ impl SdimModel {
     /// # Errors
     /// [`Error::Config`] if the preprocessor's patches are not the model's; tensor and tokenizer errors.
     pub fn new(files: CheckpointFiles, weights: &Weights, device: &Device) -> Result<Self> {
-        let CheckpointFiles { config, preprocessor, settings, tokenizer } = files;
+        let CheckpointFiles { config, preprocessor, settings, tokenizer, stop_ids } = files;
         check_patches(&preprocessor, &config)?;
         let prompts = PromptWriter::new(&settings, &tokenizer)?;
         let Parts { vlm, injection, glimpse } = Parts::new(config, &settings, weights)?;
@@ -184,6 +190,7 @@ impl SdimModel {
             preprocessor,
             prompts,
             tokenizer,
+            stop_ids,
             number_rows,
             device: device.clone(),
         })

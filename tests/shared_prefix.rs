@@ -11,6 +11,7 @@ use sdim::model::SdimModel;
 use sdim::query::number::{DepthUnit, DigitReader, NumberFormat, Reading, read_bins};
 use sdim::query::prompt::Tokens;
 use sdim::query::{Hint, MeasurementPrompt, PixelReference, Prefix, Query, Settings, ask};
+use sdim::supervise::init::FreshFiles;
 use sdim::vlm::decoder::{Context, Keep};
 use sdim::vlm::rope::{Position, RopeLayout};
 
@@ -31,17 +32,13 @@ struct Setup {
 impl Setup {
     /// `text_tokens` of a suffix, if not all of them are.
     fn new(settings: &Settings, small: bool, text_tokens: Option<usize>) -> Self {
-        let files = if small {
-            tiny::small_files(settings)
-        } else {
-            sdim::supervise::init::FreshFiles::tiny(settings).unwrap()
-        };
+        let files = if small { tiny::small_files(settings) } else { FreshFiles::tiny(settings).unwrap() };
+        Self::of(files, text_tokens)
+    }
+
+    fn of(files: FreshFiles, text_tokens: Option<usize>) -> Self {
         let mut tensors = tiny::tensors(&files, 11);
-        if let Some(glimpse) = tensors.get_mut("sdim.glimpse.weight") {
-            // A fresh one is zero and would hide whose crop goes where.
-            let wave: Vec<f32> = (0..glimpse.elem_count()).map(|i| (i as f32 * 0.37).sin() * 0.02).collect();
-            *glimpse = Tensor::from_vec(wave, glimpse.dims(), &Device::Cpu).unwrap();
-        }
+        tiny::wake(&mut tensors);
         let model = tiny::model(&files, tensors);
         let (rgb, sparse): (RgbImage, SparseDepth) = tiny::frame(90, 70);
         let (pixels, scattered) = model.preprocess(&rgb, &sparse).unwrap();
@@ -270,6 +267,61 @@ fn queries_in_words_read_the_same_alone_and_in_any_batch() {
 fn digits_after_a_pointer_go_on_where_the_text_stopped() {
     // "at ", "?" and "is " are seven bytes, one token each.
     Setup::new(&pointer_and_digits(), true, Some(7)).check_readings(40, 8);
+}
+
+#[test]
+fn models_of_other_shapes_read_the_same_alone_and_in_any_batch() {
+    for shape in &tiny::MIDDLE {
+        println!("{shape:?}");
+        Setup::of(tiny::files(&pointer_in_words(), shape), None).check_readings(30, 5);
+        Setup::of(tiny::files(&coordinates_and_digits(), shape), None).check_readings(16, 2);
+        Setup::of(tiny::files(&pointer_and_digits(), shape), Some(7)).check_readings(20, 4);
+    }
+}
+
+#[test]
+fn text_after_the_image_goes_on_at_its_larger_side_and_not_at_its_number_of_tokens() {
+    let setup = Setup::new(&coordinates_and_digits(), true, None);
+    let (query, space) = (setup.queries(5)[4], setup.prefix.space);
+    let suffix = setup.suffix(&query);
+    let ids = &setup.model.vlm.config.ids;
+    // Written out here: the positions of one run over all, as the reference counts them.
+    let template = &setup.model.prompts.settings().template;
+    let text = |t: &str| setup.model.tokenizer.encode(t).unwrap().len();
+    let (before, after) = (text(&template.before_image), text(&template.after_image));
+    let (rows, cols) = space.merged;
+    assert!(rows != cols && rows * cols > rows.max(cols), "{rows}x{cols} tells nothing");
+    let by_hand = |step: usize| -> Vec<Position> {
+        let start = before as f32;
+        let image = (0..rows * cols).map(|i| Position {
+            t: start,
+            h: start + (i / cols) as f32,
+            w: start + (i % cols) as f32,
+        });
+        let texts = (0..after + suffix.len()).map(|i| Position::text((before + step + i) as f32));
+        (0..before).map(|i| Position::text(i as f32)).chain(image).chain(texts).collect()
+    };
+    let right = by_hand(rows.max(cols));
+    assert_eq!(setup.prefix.ids.iter().filter(|&&id| id == ids.image).count(), rows * cols);
+    assert_eq!(setup.prefix.cache.len(), before + rows * cols + after, "tokens");
+    assert_eq!(space.next, (before + rows.max(cols) + after) as f32, "position");
+    assert_eq!([setup.positions.as_slice(), &suffix.positions].concat(), right);
+    // The next digit of the answer goes on there, too; and positions that counted tokens would have shown.
+    let run = |positions: &[Position]| {
+        let own = setup.embed(std::slice::from_ref(&suffix));
+        let embedded = Tensor::cat(&[&setup.embedded, &own], 0).unwrap();
+        setup
+            .model
+            .vlm
+            .prefill(&embedded, positions, &mut setup.model.vlm.decoder.cache(1), Keep::All)
+            .unwrap()
+    };
+    let last =
+        |hidden: Tensor| hidden.narrow(0, hidden.dim(0).unwrap() - suffix.len(), suffix.len()).unwrap();
+    let together = setup.together(std::slice::from_ref(&suffix));
+    assert!(relative_difference(&together, &last(run(&right))) <= TOLERANCE);
+    let counted = relative_difference(&together, &last(run(&by_hand(rows * cols))));
+    assert!(counted > 10.0 * TOLERANCE, "token count as position: {counted:.1e}");
 }
 
 #[test]

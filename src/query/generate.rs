@@ -53,7 +53,10 @@ impl<'a> Voice<'a> {
         let Some(digits) = digits else {
             return Err(Error::argument("answer mode", "generate", "a checkpoint that writes digits"));
         };
-        let stop: Vec<u32> = generation.stop.iter().map(|t| model.tokenizer.id(t)).collect::<Result<_>>()?;
+        let stop = match &generation.stop {
+            Some(tokens) => tokens.iter().map(|t| model.tokenizer.id(t)).collect::<Result<_>>()?,
+            None => model.stop_ids.clone(),
+        };
         Ok(Self { generation, stop, usable: model.tokenizer.vocab_size(), digits })
     }
 

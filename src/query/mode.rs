@@ -24,17 +24,13 @@ pub struct Generation {
     /// Divides the logits of all tokens seen so far (multiplies those below 0); 1 is none. The published generation config of
     /// Qwen2.5-VL has 1.05, which pulls away from the very digits that a prompt states, so it is off here.
     pub repetition_penalty: f32,
-    /// Tokens that end an answer. The two of Qwen2.5-VL's published generation config, unless said otherwise.
-    pub stop: Vec<String>,
+    /// Tokens that end an answer; `null` for those of the checkpoint's generation config.
+    pub stop: Option<Vec<String>>,
 }
 
 impl Default for Generation {
     fn default() -> Self {
-        Self {
-            max_new_tokens: 64,
-            repetition_penalty: 1.0,
-            stop: vec!["<|im_end|>".into(), "<|endoftext|>".into()],
-        }
+        Self { max_new_tokens: 64, repetition_penalty: 1.0, stop: None }
     }
 }
 
@@ -63,7 +59,12 @@ impl AnswerMode {
             g.repetition_penalty.to_string(),
             "a positive number; 1 for none",
         )?;
-        check(!g.stop.is_empty(), "answer_mode.stop", "[]".into(), "at least one token")?;
+        check(
+            g.stop.as_ref().is_none_or(|s| !s.is_empty()),
+            "answer_mode.stop",
+            "[]".into(),
+            "at least one token, or null",
+        )?;
         check(
             matches!(settings.number, NumberFormat::Digits { .. }),
             "answer_mode.kind",

@@ -34,7 +34,10 @@ impl GenerationConfig {
     /// # Errors
     /// [`Error::Io`]; [`Error::Format`] if a file is no JSON; [`Error::Config`] names the key.
     pub fn from_dir(dir: impl AsRef<Path>) -> Result<Self> {
-        let source = Source::dir(dir.as_ref());
+        Self::read(&Source::dir(dir.as_ref()))
+    }
+
+    pub(crate) fn read(source: &Source) -> Result<Self> {
         let mut generation = Self { repetition_penalty: 1.0, stop_ids: Vec::new() };
         if source.has(GENERATION) {
             let (file, json) = source.json(GENERATION)?;
