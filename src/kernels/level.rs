@@ -14,6 +14,9 @@ enum Isa {
     Avx2,
     #[cfg(target_arch = "x86_64")]
     Avx512,
+    /// AVX-512, and AMX for packed weights.
+    #[cfg(target_arch = "x86_64")]
+    Amx,
 }
 
 impl Level {
@@ -34,6 +37,9 @@ impl Level {
                 && is_x86_feature_detected!("avx512bw")
             {
                 levels.push(Level(Isa::Avx512));
+                if super::packed::amx_usable() {
+                    levels.push(Level(Isa::Amx));
+                }
             }
         }
         levels
@@ -47,12 +53,20 @@ impl Level {
             Isa::Avx2 => "avx2",
             #[cfg(target_arch = "x86_64")]
             Isa::Avx512 => "avx512",
+            #[cfg(target_arch = "x86_64")]
+            Isa::Amx => "amx",
         }
     }
 
+    /// AVX-512 at least.
     #[cfg(target_arch = "x86_64")]
     pub(super) fn is_avx512(self) -> bool {
-        self.0 == Isa::Avx512
+        matches!(self.0, Isa::Avx512 | Isa::Amx)
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    pub(super) fn is_amx(self) -> bool {
+        self.0 == Isa::Amx
     }
 
     #[cfg(target_arch = "x86_64")]

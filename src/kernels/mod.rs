@@ -5,8 +5,9 @@
 //! threads), with its own backward pass. Every other device and type takes the same mathematics
 //! composed from candle operations.
 //!
-//! The environment variable `SDIM_KERNEL` = `portable`, `avx2` or `avx512` forces one instruction
-//! set, if the machine has it; it is read once, at the first call.
+//! The environment variable `SDIM_KERNEL` = `portable`, `avx2`, `avx512` or `amx` forces one instruction
+//! set, if the machine has it; it is read once, at the first call. (AMX multiplies packed weights only; with
+//! it, everything else uses AVX-512.)
 //!
 //! This module knows nothing of images or depth, and is the only home of `unsafe` in the crate.
 
@@ -48,7 +49,7 @@ pub use conv::conv3x3;
 pub use linear::linear;
 pub use memory::keep_freed_memory;
 pub use norm::rms_norm;
-pub use packed::{PackedWeight, WeightFormat};
+pub use packed::{PackedGate, PackedWeight, WeightFormat};
 pub use peak::peak_gflops;
 pub use rope::rope;
 pub use scale_shift::{affine_act, batch_norm_act};

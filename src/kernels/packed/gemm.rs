@@ -1,20 +1,21 @@
 //! How a product is cut into tasks and tiles.
 
+use super::super::math::sigmoid;
 use super::isa::Kernel;
 use super::lhs::Left;
-use super::panel::{Panels, WIDTH};
-use super::tile::{Dot, Operands, tile};
+use super::panel::{HALF, Panels, STEP_BLOCK, WIDTH};
+use super::tile::{Operands, Tile};
 use rayon::prelude::*;
 use std::ops::Range;
 
 /// Steps of a panel multiplied at once: what of it stays in the second-level cache beside the rows of a task.
-const STEPS: usize = 1024;
+const STEPS: usize = 512;
 /// Rows of a task.
-const ROWS: usize = 96;
+pub(super) const TASK_ROWS: usize = 96;
 /// Panels of a task, at most: what of the sums stays in the second-level cache between blocks of steps.
 const PANELS: usize = 8;
 /// Most rows of a tile.
-const TALLEST: usize = 12;
+const TALLEST: usize = 32;
 
 /// What is done to the sums.
 #[derive(Clone, Copy)]
@@ -23,6 +24,8 @@ pub(super) struct Finish<'a> {
     pub(super) bias: Option<&'a [f32]>,
     /// For sums that are integers.
     pub(super) channels: Option<Channels<'a>>,
+    /// Whether a panel's first half are gates of the other: `silu(first) * second`.
+    pub(super) gated: bool,
 }
 
 /// What turns the integer sums of each channel into its outputs.
@@ -34,9 +37,27 @@ pub(super) struct Channels<'a> {
 }
 
 impl Finish<'_> {
+    /// Outputs of a panel.
+    fn width(&self) -> usize {
+        if self.gated { HALF } else { WIDTH }
+    }
+
     /// One row of a panel, from channel `first` on.
     #[inline(always)]
-    fn row(&self, sums: &[u32], scale: f32, first: usize, out: &mut [f32]) {
+    fn row<const LANES: usize>(&self, sums: &[u32], scale: f32, first: usize, out: &mut [f32]) {
+        if !self.gated {
+            return self.plain(sums, scale, first, out);
+        }
+        let mut both = [0f32; WIDTH];
+        self.plain(sums, scale, first, &mut both);
+        let (gates, values) = both.split_at(HALF);
+        for ((o, &gate), value) in out.iter_mut().zip(gates).zip(values) {
+            *o = gate * sigmoid::<LANES>(gate) * value;
+        }
+    }
+
+    #[inline(always)]
+    fn plain(&self, sums: &[u32], scale: f32, first: usize, out: &mut [f32]) {
         match self.channels {
             None => {
                 for (o, sum) in out.iter_mut().zip(sums) {
@@ -64,6 +85,8 @@ pub(super) struct Job<'a> {
     pub(super) kernel: Kernel,
     pub(super) left: &'a Left,
     pub(super) panels: &'a Panels,
+    /// Outputs.
+    pub(super) m: usize,
     pub(super) finish: Finish<'a>,
 }
 
@@ -94,17 +117,19 @@ impl Target {
 impl Job<'_> {
     /// Writes every element of `out`, `[n, m]`.
     pub(super) fn run(&self, out: &mut [f32]) {
-        let (n, m) = (self.left.n, self.panels.m);
+        let (n, m) = (self.left.n, self.m);
         assert_eq!(out.len(), n * m);
         if out.is_empty() {
             return;
         }
         let target = Target { data: out.as_mut_ptr(), columns: m };
-        let (across, down) = (m.div_ceil(PANELS * WIDTH), n.div_ceil(ROWS));
+        let count = m.div_ceil(self.finish.width());
+        assert!(count * WIDTH * self.panels.steps <= self.panels.words().len());
+        let (across, down) = (count.div_ceil(PANELS), n.div_ceil(TASK_ROWS));
         (0..across * down).into_par_iter().for_each(|task| {
-            let (row, panel) = (task / across * ROWS, task % across * PANELS);
-            let rows = row..n.min(row + ROWS);
-            let panels = panel..m.div_ceil(WIDTH).min(panel + PANELS);
+            let (row, panel) = (task / across * TASK_ROWS, task % across * PANELS);
+            let rows = row..n.min(row + TASK_ROWS);
+            let panels = panel..count.min(panel + PANELS);
             // SAFETY: a `Kernel` exists only where the CPU has its instructions; its panels and rows were made
             // for it; no two tasks share both a row and a panel.
             unsafe { (self.kernel.run)(self, target, rows, panels) }
@@ -115,51 +140,73 @@ impl Job<'_> {
 /// Writes the product's `rows` and `panels`.
 ///
 /// # Safety
-/// The CPU must have `D`'s instructions, and the job must be for `D`. `target` must be the `[n, m]` result, in which
+/// The CPU must have `T`'s instructions, and the job must be for `T`. `target` must be the `[n, m]` result, in which
 /// nothing else uses these rows of these panels.
 #[inline(always)]
-pub(super) unsafe fn run<D: Dot>(job: &Job<'_>, target: Target, rows: Range<usize>, panels: Range<usize>) {
+pub(super) unsafe fn run<T: Tile>(job: &Job<'_>, target: Target, rows: Range<usize>, panels: Range<usize>) {
     let Job { left, panels: weight, .. } = job;
-    let (total, m) = (weight.steps, weight.m);
-    assert!(rows.end <= left.n && panels.end <= m.div_ceil(WIDTH));
-    assert!(total * D::WORDS <= left.stride);
-    // Tiles of equal height, so that none is too low to keep the multipliers busy.
-    let tiles = rows.len().div_ceil(D::ROWS);
-    let tile_rows = |t: usize| t * rows.len() / tiles..(t + 1) * rows.len() / tiles;
-    let blocks = total.div_ceil(STEPS).max(1);
-    let mut scratch = vec![0u32; if blocks == 1 { 0 } else { rows.len() * panels.len() * WIDTH }];
+    // SAFETY: the caller has the instructions.
+    let mut state = unsafe { T::start() };
+    let tiles = rows.len().div_ceil(T::ROWS);
+    // Even tiles, so that none is too low to keep the multipliers busy.
+    let bound = |t: usize| if T::EVEN { t * rows.len() / tiles } else { rows.len().min(t * T::ROWS) };
+    // Blocks of steps cut a sum, but do not change its order.
+    let blocks = weight.steps.div_ceil(STEPS).max(1);
+    let mut kept = vec![0u32; if blocks == 1 { 0 } else { rows.len() * panels.len() * WIDTH }];
     let mut single = [0u32; TALLEST * WIDTH];
     for block in 0..blocks {
-        let first = block * total / blocks;
-        let steps = (block + 1) * total / blocks - first;
+        let steps = block * STEPS..weight.steps.min((block + 1) * STEPS);
         for (i, panel) in panels.clone().enumerate() {
-            let right = &weight.words()[(panel * total + first) * WIDTH..][..steps * WIDTH];
+            let right = (panel * weight.steps + steps.start) * WIDTH;
+            let right = &weight.words()[right..right + steps.len() * WIDTH];
             for t in 0..tiles {
-                let local = tile_rows(t);
+                let (first, count) = (bound(t), bound(t + 1) - bound(t));
                 let sums = if blocks == 1 {
-                    let sums = &mut single[..local.len() * WIDTH];
+                    let sums = &mut single[..count * WIDTH];
                     sums.fill(0);
                     sums
                 } else {
-                    &mut scratch[(i * rows.len() + local.start) * WIDTH..][..local.len() * WIDTH]
+                    &mut kept[(i * rows.len() + first) * WIDTH..][..count * WIDTH]
                 };
-                let row = rows.start + local.start;
-                let words = &left.words()[row * left.stride + first * D::WORDS..];
-                assert!((local.len() - 1) * left.stride + steps * D::WORDS <= words.len());
-                let operands =
-                    Operands { left: words.as_ptr(), stride: left.stride, right: right.as_ptr(), steps };
-                // SAFETY: the caller's promise for the CPU; the sizes were checked above.
-                unsafe { tile::<D>(local.len(), operands, sums.as_mut_ptr()) };
-                if block + 1 < blocks {
-                    continue;
-                }
-                let columns = panel * WIDTH..m.min((panel + 1) * WIDTH);
-                for (r, sums) in sums.chunks_exact(WIDTH).enumerate() {
-                    // SAFETY: the caller's promise; the panel's last column is below `m`.
-                    let out = unsafe { target.row(row + r, columns.clone()) };
-                    job.finish.row(sums, left.scales[row + r], columns.start, out);
+                let row = rows.start + first;
+                let operands = operands::<T>(left, row..row + count, right, &steps);
+                // SAFETY: the caller's promise for the CPU; the operands and the sums are long enough.
+                unsafe { T::multiply(&mut state, count, operands, sums.as_mut_ptr()) };
+                if block + 1 == blocks {
+                    // SAFETY: the caller's promise.
+                    unsafe { finish::<T>(job, target, row, panel, sums) };
                 }
             }
+        }
+    }
+}
+
+/// Checks that all of them is there.
+#[inline(always)]
+fn operands<T: Tile>(left: &Left, rows: Range<usize>, right: &[u32], steps: &Range<usize>) -> Operands {
+    assert!(steps.len() * WIDTH <= right.len() && steps.len().is_multiple_of(STEP_BLOCK));
+    assert!(rows.end <= left.n && steps.end * T::WORDS <= left.stride);
+    let words = &left.words()[rows.start * left.stride + steps.start * T::WORDS..];
+    assert!(rows.len() * left.stride <= words.len() + steps.start * T::WORDS);
+    Operands { left: words.as_ptr(), stride: left.stride, right: right.as_ptr(), steps: steps.len() }
+}
+
+/// Writes the rows of a panel from the sums.
+///
+/// # Safety
+/// As for [`run`], for these rows and this panel.
+#[inline(always)]
+unsafe fn finish<T: Tile>(job: &Job<'_>, target: Target, row: usize, panel: usize, sums: &[u32]) {
+    let width = job.finish.width();
+    let columns = panel * width..job.m.min((panel + 1) * width);
+    for (r, sums) in sums.chunks_exact(WIDTH).enumerate() {
+        // SAFETY: the caller's promise; the last column is below `m`.
+        let out = unsafe { target.row(row + r, columns.clone()) };
+        let scale = job.left.scales[row + r];
+        match T::LANES {
+            16 => job.finish.row::<16>(sums, scale, panel * WIDTH, out),
+            8 => job.finish.row::<8>(sums, scale, panel * WIDTH, out),
+            _ => job.finish.row::<4>(sums, scale, panel * WIDTH, out),
         }
     }
 }

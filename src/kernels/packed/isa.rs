@@ -7,6 +7,7 @@ use super::dot_bf16::Widened;
 use super::gemm::{Job, Target, run};
 use super::lhs;
 use super::quantise;
+use super::tile::Tile;
 use std::ops::Range;
 use std::sync::Once;
 
@@ -18,6 +19,8 @@ pub(super) struct Kernel {
     pub(super) per_step: usize,
     /// Words of a row in one step.
     pub(super) words: usize,
+    /// Rows that may be read after the last.
+    pub(super) spare_rows: usize,
     /// Converts a row of activations; returns its scale.
     ///
     /// # Safety
@@ -41,7 +44,8 @@ macro_rules! kernel {
                 // SAFETY: the caller's promise.
                 unsafe { run::<$dot>(job, target, rows, panels) }
             }
-            Kernel { name: $name, per_step: $per_step, words: $words, convert, run: multiply }
+            let spare_rows = if <$dot as Tile>::EVEN { 0 } else { <$dot as Tile>::ROWS };
+            Kernel { name: $name, per_step: $per_step, words: $words, spare_rows, convert, run: multiply }
         };
     };
 }
@@ -53,6 +57,8 @@ kernel!(INT8_PORTABLE = "portable", 4, 2, quantise::unsigned_pairs, super::dot_i
 kernel!(INT8_PORTABLE = "portable", 4, 2, quantise::unsigned_pairs, super::dot_int8::x86::Pairs128);
 #[cfg(target_arch = "x86_64")]
 mod x86 {
+    use super::super::amx::Tiles;
+    use super::super::amx_unit;
     use super::super::dot_bf16::x86::Bf16;
     use super::super::dot_int8::x86::{Pairs256, Pairs512, Vnni256, Vnni512};
     use super::*;
@@ -69,6 +75,8 @@ mod x86 {
         Pairs512,
         "avx512f,avx512vl,avx512dq,avx512bw,avx2,fma"
     );
+    kernel!(BF16_AMX = "amx", 2, 1, lhs::pairs, Tiles<amx_unit::Tiles, false>, "avx512f,avx512vl,avx512dq,avx512bw,avx2,fma");
+    kernel!(INT8_AMX = "amx", 4, 1, quantise::unsigned_bytes, Tiles<amx_unit::Tiles, true>, "avx512f,avx512vl,avx512dq,avx512bw,avx2,fma");
     kernel!(
         INT8_AVX512_VNNI = "avx512-vnni",
         4,
@@ -89,9 +97,12 @@ mod x86 {
 
 /// The kernels of a level: without its extensions, and with those that the machine has.
 pub(super) fn kernels(level: Level, format: WeightFormat) -> (Kernel, Option<Kernel>) {
-    let int8 = format == WeightFormat::Int8;
     #[cfg(target_arch = "x86_64")]
     {
+        let int8 = format == WeightFormat::Int8;
+        if level.is_amx() {
+            return (Kernel::amx(format), None);
+        }
         if level.is_avx512() && int8 {
             return (
                 x86::INT8_AVX512,
@@ -109,10 +120,29 @@ pub(super) fn kernels(level: Level, format: WeightFormat) -> (Kernel, Option<Ker
         }
     }
     let _ = level;
-    (if int8 { INT8_PORTABLE } else { BF16_PORTABLE }, None)
+    (Kernel::portable(format), None)
 }
 
 impl Kernel {
+    pub(super) fn portable(format: WeightFormat) -> Kernel {
+        if format == WeightFormat::Int8 { INT8_PORTABLE } else { BF16_PORTABLE }
+    }
+
+    /// For a machine that has AMX, which the caller must know.
+    #[cfg(target_arch = "x86_64")]
+    pub(super) fn amx(format: WeightFormat) -> Kernel {
+        if format == WeightFormat::Int8 { x86::INT8_AMX } else { x86::BF16_AMX }
+    }
+
+    /// The AMX kernels by plain code.
+    #[cfg(test)]
+    pub(super) fn emulated_amx(format: WeightFormat) -> Kernel {
+        use super::amx::{Emulated, Tiles};
+        kernel!(BF16 = "amx, emulated", 2, 1, lhs::pairs, Tiles<Emulated, false>);
+        kernel!(INT8 = "amx, emulated", 4, 1, quantise::unsigned_bytes, Tiles<Emulated, true>);
+        if format == WeightFormat::Int8 { INT8 } else { BF16 }
+    }
+
     /// The fastest kernel of the level in use.
     pub(super) fn current(format: WeightFormat) -> Kernel {
         static TOLD: Once = Once::new();

@@ -1,12 +1,22 @@
 //! Activations, converted once per product to what the kernel reads.
 
+use super::gemm::TASK_ROWS;
 use super::isa::Kernel;
-use super::panel::Words;
+use super::panel::{Words, padded_steps};
 use super::words::{bf16, from_f32};
 use rayon::prelude::*;
 
 /// Rows converted in one task.
 const ROWS: usize = 16;
+
+/// Bytes converted at once: what stays in the cache, and what a thread keeps from one product to the next.
+const AT_ONCE: usize = 8 << 20;
+
+/// Rows to convert and multiply at once.
+pub(super) fn rows_at_once(kernel: Kernel, k: usize) -> usize {
+    let bytes = padded_steps(k, kernel.per_step).max(1) * kernel.words * size_of::<u32>();
+    (AT_ONCE / bytes).next_multiple_of(TASK_ROWS).max(4 * TASK_ROWS)
+}
 
 /// Rows of words. A row starts at a cache line, and an odd number of lines after the one before, so that
 /// the rows of a tile do not compete for the same sets of the cache.
@@ -21,20 +31,26 @@ pub(super) struct Left {
 impl Left {
     /// Converts `x` `[n, k]`.
     pub(super) fn new(kernel: Kernel, x: &[f32], n: usize, k: usize) -> Self {
-        let stride = ((k.div_ceil(kernel.per_step) * kernel.words).div_ceil(16) | 1) * 16;
-        let mut words = Words::zeros(n * stride);
+        let used = k.div_ceil(kernel.per_step) * kernel.words;
+        let stride = ((padded_steps(k, kernel.per_step) * kernel.words).div_ceil(16) | 1) * 16;
+        let mut words = Words::recycled((n + kernel.spare_rows) * stride);
         let mut scales = vec![1f32; n];
-        if k > 0 {
-            let rows = words.get_mut().par_chunks_mut(ROWS * stride).zip(x.par_chunks(ROWS * k));
-            rows.zip(scales.par_chunks_mut(ROWS)).for_each(|((words, x), scales)| {
-                let rows = words.chunks_exact_mut(stride).zip(x.chunks_exact(k));
-                for ((words, x), scale) in rows.zip(scales) {
-                    // SAFETY: a `Kernel` exists only where the CPU has its instructions.
-                    *scale = unsafe { (kernel.convert)(words, x) };
-                }
-            });
-        }
+        let rows = words.get_mut()[..n * stride].par_chunks_mut(ROWS * stride).enumerate();
+        rows.zip(scales.par_chunks_mut(ROWS)).for_each(|((chunk, words), scales)| {
+            for (r, (words, scale)) in words.chunks_exact_mut(stride).zip(scales).enumerate() {
+                let row = chunk * ROWS + r;
+                let (words, padding) = words.split_at_mut(used);
+                // SAFETY: a `Kernel` exists only where the CPU has its instructions.
+                *scale = unsafe { (kernel.convert)(words, &x[row * k..(row + 1) * k]) };
+                padding.fill(0);
+            }
+        });
         Left { words, n, stride, scales }
+    }
+
+    /// Keeps the buffer for this thread's next product.
+    pub(super) fn recycle(self) {
+        self.words.recycle();
     }
 
     pub(super) fn words(&self) -> &[u32] {

@@ -6,8 +6,13 @@
 //! through the inner dimension: two bf16 or four signed bytes. That is what the dot-product
 //! instructions take (AVX512-BF16, VNNI, AMX), and what others widen in registers.
 
+#[cfg(any(test, target_arch = "x86_64"))]
+mod amx;
+#[cfg(target_arch = "x86_64")]
+mod amx_unit;
 mod dot_bf16;
 mod dot_int8;
+mod gate;
 mod gemm;
 mod isa;
 mod lhs;
@@ -23,10 +28,14 @@ mod words;
 use super::exec::{dims2, expect_dims, read, tensor};
 use crate::error::{Error, Result};
 use candle_core::{DType, Tensor};
+pub use gate::PackedGate;
 use gemm::{Channels, Finish, Job};
 use isa::Kernel;
 use lhs::Left;
 use panel::Panels;
+
+#[cfg(target_arch = "x86_64")]
+pub(super) use amx_unit::usable as amx_usable;
 
 /// How the weights of a model are held in memory.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -152,13 +161,7 @@ impl PackedWeight {
             expect_dims("bias", bias, &[m])?;
             expect_cpu_f32("bias", bias)?;
         }
-        let product = |x: &[f32], bias: Option<&[f32]>| {
-            let left = Left::new(kernel, x, n, k);
-            let job = Job { kernel, left: &left, panels: &self.panels, finish: self.finish(bias) };
-            let mut out = vec![0f32; n * m];
-            job.run(&mut out);
-            Ok(out)
-        };
+        let product = |x: &[f32], bias: Option<&[f32]>| Ok(self.product(kernel, x, n, m, self.finish(bias)));
         let out = read(x, |x| match bias {
             Some(bias) => read(bias, |bias| product(x, Some(bias))),
             None => product(x, None),
@@ -166,9 +169,23 @@ impl PackedWeight {
         Ok(tensor(out, (n, m))?)
     }
 
+    /// `[n, m]`, of the `m` outputs that `finish` leaves.
+    fn product(&self, kernel: Kernel, x: &[f32], n: usize, m: usize, finish: Finish<'_>) -> Vec<f32> {
+        let k = self.panels.k;
+        let mut out = vec![0f32; n * m];
+        let rows = lhs::rows_at_once(kernel, k);
+        for (i, out) in out.chunks_mut((rows * m).max(1)).enumerate() {
+            let n = out.len() / m;
+            let left = Left::new(kernel, &x[i * rows * k..(i * rows + n) * k], n, k);
+            Job { kernel, left: &left, panels: &self.panels, m, finish }.run(out);
+            left.recycle();
+        }
+        out
+    }
+
     fn finish<'a>(&'a self, bias: Option<&'a [f32]>) -> Finish<'a> {
         let channels = Channels { scales: &self.scales, offsets: &self.offsets };
-        Finish { bias, channels: (self.format == WeightFormat::Int8).then_some(channels) }
+        Finish { bias, gated: false, channels: (self.format == WeightFormat::Int8).then_some(channels) }
     }
 
     /// Rows of the weight as f32 `[ids, k]`: an embedding lookup, or some rows of an output head.

@@ -1,11 +1,21 @@
 //! Weights as panels of 32 output channels.
 
 use rayon::prelude::*;
+use std::cell::Cell;
 
 /// Output channels of a panel.
 pub(super) const WIDTH: usize = 32;
+/// Channels of each weight in a panel of two.
+pub(super) const HALF: usize = WIDTH / 2;
+/// Steps come in so many, as a tile unit takes them.
+pub(super) const STEP_BLOCK: usize = 16;
 /// Words transposed together: the part of 32 rows that stays in the first-level cache.
 const PIECE: usize = 128;
+
+thread_local!(
+    /// The buffer of this thread's last product, so that the next need not have fresh pages from the system.
+    static SPARE: Cell<Vec<u32>> = const { Cell::new(Vec::new()) }
+);
 
 /// Words whose first is at the start of a cache line, so that no register-wide load crosses one.
 #[derive(Debug)]
@@ -24,6 +34,21 @@ impl Words {
         Words { data, start, len }
     }
 
+    /// With whatever an earlier buffer of this thread held.
+    pub(super) fn recycled(len: usize) -> Self {
+        let data = SPARE.take();
+        if data.len() < len + 15 {
+            return Words::zeros(len);
+        }
+        let start = data.as_ptr().align_offset(64).min(15);
+        Words { data, start, len }
+    }
+
+    /// Keeps the buffer for [`Words::recycled`].
+    pub(super) fn recycle(self) {
+        SPARE.set(self.data);
+    }
+
     pub(super) fn get(&self) -> &[u32] {
         &self.data[self.start..self.start + self.len]
     }
@@ -39,7 +64,7 @@ pub(super) struct Panels {
     words: Words,
     pub(super) m: usize,
     pub(super) k: usize,
-    /// Steps through the inner dimension.
+    /// Steps through the inner dimension, those that pad it included.
     pub(super) steps: usize,
 }
 
@@ -51,7 +76,7 @@ impl Panels {
         per_step: usize,
         fill: impl Fn(usize, &mut [u32]) -> T + Sync,
     ) -> (Self, Vec<T>) {
-        let steps = k.div_ceil(per_step);
+        let steps = padded_steps(k, per_step);
         let mut words = Words::zeros(m.div_ceil(WIDTH) * WIDTH * steps);
         if steps == 0 {
             let results = (0..m).map(|row| fill(row, &mut [])).collect();
@@ -62,13 +87,30 @@ impl Panels {
             let count = WIDTH.min(m - first);
             rows.resize(WIDTH * steps, 0);
             let filled = rows.chunks_exact_mut(steps).take(count).enumerate();
-            let results = filled.map(|(r, row)| fill(first + r, row)).collect();
+            let results = filled.map(|(r, row)| fill(first + r, &mut row[..k.div_ceil(per_step)])).collect();
             transpose(panel, rows, steps, count);
             results
         };
         let panels = words.get_mut().par_chunks_exact_mut(WIDTH * steps).enumerate();
         let results: Vec<Vec<T>> = panels.map_init(Vec::new, pack).collect();
         (Panels { words, m, k, steps }, results.into_iter().flatten().collect())
+    }
+
+    /// Panels of two weights of the same size, each of 16 channels of `self` and the same 16 of `other`.
+    pub(super) fn interleave(&self, other: &Panels) -> Panels {
+        let (steps, m) = (self.steps, self.m.div_ceil(HALF) * WIDTH);
+        let mut words = Words::zeros(m * steps);
+        let fill = |(p, panel): (usize, &mut [u32])| {
+            let at = p / 2 * WIDTH * steps + p % 2 * HALF;
+            for (step, out) in panel.chunks_exact_mut(WIDTH).enumerate() {
+                let at = at + step * WIDTH;
+                let (first, second) = out.split_at_mut(HALF);
+                first.copy_from_slice(&self.words()[at..at + HALF]);
+                second.copy_from_slice(&other.words()[at..at + HALF]);
+            }
+        };
+        words.get_mut().par_chunks_exact_mut((WIDTH * steps).max(1)).enumerate().for_each(fill);
+        Panels { words, m, k: self.k, steps }
     }
 
     /// All panels.
@@ -87,6 +129,11 @@ impl Panels {
         let words = &self.words()[panel..panel + WIDTH * self.steps];
         words.chunks_exact(WIDTH).map(move |step| step[row % WIDTH])
     }
+}
+
+/// Steps for `k` values, `per_step` to a step.
+pub(super) fn padded_steps(k: usize, per_step: usize) -> usize {
+    k.div_ceil(per_step).next_multiple_of(STEP_BLOCK)
 }
 
 /// `count` rows of `steps` words to `steps` rows of [`WIDTH`].

@@ -60,22 +60,36 @@ pub(super) fn bytes(word: u32) -> [f32; 4] {
 #[inline(always)]
 pub(super) fn unsigned_bytes(words: &mut [u32], values: &[f32]) -> f32 {
     let (scale, by) = scale(values);
-    let byte = |value: f32| (nearest(value, by) + ZERO) as u32 & 0xff;
-    let (chunks, rest) = values.as_chunks::<4>();
-    for (word, v) in words.iter_mut().zip(chunks) {
-        *word = byte(v[0]) | byte(v[1]) << 8 | byte(v[2]) << 16 | byte(v[3]) << 24;
-    }
-    if let Some(word) = words.get_mut(chunks.len()) {
-        *word = rest.iter().rev().fold(0, |word, v| word << 8 | byte(*v));
+    // By way of arrays of bytes, which the compiler narrows whole registers to.
+    for (words, values) in words.chunks_mut(16).zip(values.chunks(64)) {
+        let mut bytes = [0u8; 64];
+        if let Ok(values) = <&[f32; 64]>::try_from(values) {
+            for (byte, value) in bytes.iter_mut().zip(values) {
+                *byte = unsigned(*value, by);
+            }
+        } else {
+            for (byte, value) in bytes.iter_mut().zip(values) {
+                *byte = unsigned(*value, by);
+            }
+        }
+        for (word, bytes) in words.iter_mut().zip(bytes.as_chunks::<4>().0) {
+            *word = u32::from_le_bytes(*bytes);
+        }
     }
     scale
+}
+
+/// `value * by` to the nearest integer, 128 being zero.
+#[inline(always)]
+fn unsigned(value: f32, by: f32) -> u8 {
+    nearest(value, by).wrapping_add(ZERO) as u8
 }
 
 /// The same as 16-bit pairs, two words to a step: values 0 and 2, then 1 and 3.
 #[inline(always)]
 pub(super) fn unsigned_pairs(words: &mut [u32], values: &[f32]) -> f32 {
     let (scale, by) = scale(values);
-    let byte = |value: f32| (nearest(value, by) + ZERO) as u32 & 0xff;
+    let byte = |value: f32| u32::from(unsigned(value, by));
     let (chunks, rest) = values.as_chunks::<4>();
     let (pairs, _) = words.as_chunks_mut::<2>();
     for (words, v) in pairs.iter_mut().zip(chunks) {

@@ -9,7 +9,11 @@ use candle_core::Device;
 
 pub(super) fn every_kernel(format: WeightFormat) -> Vec<Kernel> {
     let levels = Level::available().into_iter().map(|level| kernels(level, format));
-    levels.flat_map(|(plain, extended)| [Some(plain), extended]).flatten().collect()
+    levels
+        .flat_map(|(plain, extended)| [Some(plain), extended])
+        .flatten()
+        .chain([Kernel::emulated_amx(format)])
+        .collect()
 }
 
 fn rounded(values: &[f32]) -> Vec<f32> {
@@ -104,7 +108,7 @@ fn every_element_is_written() {
             let left = Left::new(kernel, &x, n, k);
             let mut out = vec![f32::NAN; n * m];
             let finish = packed.finish(None);
-            Job { kernel, left: &left, panels: &packed.panels, finish }.run(&mut out);
+            Job { kernel, left: &left, panels: &packed.panels, m, finish }.run(&mut out);
             assert!(out.iter().all(|v| v.is_finite()), "{} {n}x{k}x{m}", kernel.name);
         }
     }

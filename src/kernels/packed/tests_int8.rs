@@ -73,7 +73,7 @@ fn what_is_not_finite_spoils_its_row_only() {
 
 #[test]
 fn rows_are_within_half_a_step() {
-    let (m, k) = (40, 70);
+    let (m, k) = (40, 128);
     let w = values(&random(&[m, k], 1));
     let weight = packed(&w, m, k);
     for (row, id) in weight.rows(&[39, 0, 7]).unwrap().to_vec2::<f32>().unwrap().iter().zip([39, 0, 7]) {

@@ -38,36 +38,67 @@ pub(super) struct Operands {
     pub(super) steps: usize,
 }
 
-/// Adds to `sums`, rows of [`WIDTH`], the product of `rows` rows, at most `D::ROWS`.
+/// How some rows are multiplied by a panel: by registers of sums, or by a tile unit.
 ///
 /// # Safety
-/// The CPU must have `D`'s instructions. `left` must be good for `rows` rows of `steps * D::WORDS` words, `right` for `steps * WIDTH`
-/// words, `sums` for `rows * WIDTH`.
-#[inline(always)]
-pub(super) unsafe fn tile<D: Dot>(rows: usize, operands: Operands, sums: *mut u32) {
-    macro_rules! by_rows {
-        ($($rows:literal)+) => {
-            match rows {
-                // SAFETY: the caller's promise.
-                $($rows => unsafe { by_strips::<D, $rows>(operands, sums) },)+
-                _ => {}
-            }
-        };
-    }
-    const { assert!(D::ROWS == 6 || D::ROWS == 12) };
-    if D::ROWS == 6 || rows <= 6 {
-        by_rows!(1 2 3 4 5 6);
-    } else {
-        by_rows!(7 8 9 10 11 12);
+/// Functions may be called only where the CPU has the type's instructions.
+pub(super) trait Tile {
+    /// What a task sets up once.
+    type State;
+    /// f32 to a register.
+    const LANES: usize;
+    /// Words of a row in one step.
+    const WORDS: usize;
+    /// Most rows.
+    const ROWS: usize;
+    /// Whether rows are best shared out evenly; else as many whole tiles as there can be.
+    const EVEN: bool;
+
+    unsafe fn start() -> Self::State;
+
+    /// Adds to `sums`, rows of [`WIDTH`], the product of `rows` rows, at most `ROWS`.
+    ///
+    /// # Safety
+    /// `left` must be good for `rows` rows of `steps * WORDS` words, `right` for `steps * WIDTH` words, `sums` for `rows * WIDTH`.
+    unsafe fn multiply(state: &mut Self::State, rows: usize, operands: Operands, sums: *mut u32);
+}
+
+impl<D: Dot> Tile for D {
+    type State = ();
+    const LANES: usize = <D as Dot>::LANES;
+    const WORDS: usize = <D as Dot>::WORDS;
+    const ROWS: usize = <D as Dot>::ROWS;
+    const EVEN: bool = true;
+
+    #[inline(always)]
+    unsafe fn start() {}
+
+    #[inline(always)]
+    unsafe fn multiply(_: &mut (), rows: usize, operands: Operands, sums: *mut u32) {
+        macro_rules! by_rows {
+            ($($rows:literal)+) => {
+                match rows {
+                    // SAFETY: the caller's promise.
+                    $($rows => unsafe { by_strips::<D, $rows>(operands, sums) },)+
+                    _ => {}
+                }
+            };
+        }
+        const { assert!(<D as Dot>::ROWS == 6 || <D as Dot>::ROWS == 12) };
+        if <D as Dot>::ROWS == 6 || rows <= 6 {
+            by_rows!(1 2 3 4 5 6);
+        } else {
+            by_rows!(7 8 9 10 11 12);
+        }
     }
 }
 
 /// # Safety
-/// As [`tile`], for `ROWS` rows.
+/// As [`Tile::multiply`], for `ROWS` rows.
 #[inline(always)]
 unsafe fn by_strips<D: Dot, const ROWS: usize>(operands: Operands, sums: *mut u32) {
-    const { assert!(WIDTH.is_multiple_of(2 * D::LANES)) };
-    for column in (0..WIDTH).step_by(2 * D::LANES) {
+    const { assert!(WIDTH.is_multiple_of(2 * <D as Dot>::LANES)) };
+    for column in (0..WIDTH).step_by(2 * <D as Dot>::LANES) {
         // SAFETY: the caller's promise; a strip lies within the panel.
         unsafe {
             let strip = Operands { right: operands.right.add(column), ..operands };
@@ -77,19 +108,21 @@ unsafe fn by_strips<D: Dot, const ROWS: usize>(operands: Operands, sums: *mut u3
 }
 
 /// # Safety
-/// As [`tile`], for `ROWS` rows and `COLUMNS` registers of channels.
+/// As [`Tile::multiply`], for `ROWS` rows and `COLUMNS` registers of channels.
 #[inline(always)]
 unsafe fn by_registers<D: Dot, const ROWS: usize, const COLUMNS: usize>(operands: Operands, sums: *mut u32) {
     let Operands { left, stride, right, steps } = operands;
     // SAFETY: the caller's promise.
     unsafe {
-        let mut acc: [[D::Sum; COLUMNS]; ROWS] =
-            std::array::from_fn(|r| std::array::from_fn(|c| D::load(sums.add(r * WIDTH + c * D::LANES))));
+        let mut acc: [[D::Sum; COLUMNS]; ROWS] = std::array::from_fn(|r| {
+            std::array::from_fn(|c| D::load(sums.add(r * WIDTH + c * <D as Dot>::LANES)))
+        });
         for step in 0..steps {
             let right = right.add(step * WIDTH);
-            let right: [D::Right; COLUMNS] = std::array::from_fn(|c| D::right(right.add(c * D::LANES)));
+            let right: [D::Right; COLUMNS] =
+                std::array::from_fn(|c| D::right(right.add(c * <D as Dot>::LANES)));
             for (r, acc) in acc.iter_mut().enumerate() {
-                let left = D::left(left.add(r * stride + step * D::WORDS));
+                let left = D::left(left.add(r * stride + step * <D as Dot>::WORDS));
                 for c in 0..COLUMNS {
                     acc[c] = D::add(acc[c], left, right[c]);
                 }
@@ -97,7 +130,7 @@ unsafe fn by_registers<D: Dot, const ROWS: usize, const COLUMNS: usize>(operands
         }
         for (r, acc) in acc.iter().enumerate() {
             for (c, acc) in acc.iter().enumerate() {
-                D::store(*acc, sums.add(r * WIDTH + c * D::LANES));
+                D::store(*acc, sums.add(r * WIDTH + c * <D as Dot>::LANES));
             }
         }
     }
