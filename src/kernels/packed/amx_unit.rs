@@ -178,7 +178,7 @@ mod tests {
     #[test]
     fn a_check_runs_apart_and_may_fail() {
         assert_eq!(apart(|| Ok(rayon::current_num_threads() == 1)), Some(true));
-        assert_eq!(apart(|| Err(crate::error::Error::argument("a", 1, 2))), None);
+        assert_eq!(apart(|| Err(crate::error::Error::argument("a", 1, "2"))), None);
     }
 
     #[test]
