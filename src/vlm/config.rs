@@ -219,7 +219,8 @@ impl VlmConfig {
         };
         let vision = Node::new(file, "vision_config", vision_json);
         let tie_at = |v: &Value| v.get("tie_word_embeddings").and_then(Value::as_bool);
-        let tie = tie_at(json).or_else(|| text_json.and_then(tie_at)).unwrap_or(false);
+        // The reference ties as soon as either place says so.
+        let tie = [Some(json), text_json].into_iter().flatten().any(|v| tie_at(v) == Some(true));
         let config = Self {
             text: text_config(&text, tie)?,
             vision: vision_config(&vision)?,
@@ -292,14 +293,15 @@ fn text_config(n: &Node, tie_word_embeddings: bool) -> Result<TextConfig> {
     if n.value.get("use_sliding_window").and_then(Value::as_bool) == Some(true) {
         return n.wrong("use_sliding_window", "false (sliding windows are not implemented)");
     }
-    let rope_key = ["rope_parameters", "rope_scaling"]
+    // The reference takes the older key where both stand.
+    let rope_key = ["rope_scaling", "rope_parameters"]
         .into_iter()
         .find(|k| n.value.get(k).is_some_and(Value::is_object));
     let Some(rope_key) = rope_key else {
         return n.wrong("rope_scaling", "an object with `mrope_section`");
     };
     let rope = Node::new(n.file, rope_key, &n.value[rope_key]);
-    let kind = rope.value.get("type").or_else(|| rope.value.get("rope_type")).and_then(Value::as_str);
+    let kind = rope.value.get("rope_type").or_else(|| rope.value.get("type")).and_then(Value::as_str);
     if !matches!(kind, Some("mrope" | "default")) {
         return rope.wrong("type", "\"mrope\" or \"default\"");
     }
@@ -313,7 +315,10 @@ fn text_config(n: &Node, tie_word_embeddings: bool) -> Result<TextConfig> {
         hidden_size: n.size("hidden_size")?,
         layers: n.size_up_to("num_hidden_layers", 1024)?,
         heads: n.size("num_attention_heads")?,
-        kv_heads: n.size("num_key_value_heads")?,
+        kv_heads: match n.value.get("num_key_value_heads") {
+            Some(Value::Null) => n.size("num_attention_heads")?,
+            _ => n.size("num_key_value_heads")?,
+        },
         intermediate_size: n.size("intermediate_size")?,
         vocab_size: n.size("vocab_size")?,
         // Class defaults of the reference for absent keys: eps 1e-5, theta 1e6.
@@ -345,4 +350,55 @@ fn vision_config(n: &Node) -> Result<VisionConfig> {
         },
         out_hidden_size: n.size_or("out_hidden_size", 3584)?,
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    fn small() -> Value {
+        let file = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/fixtures/qwen_small/config.json");
+        read_json(Path::new(file)).unwrap()
+    }
+
+    fn read(change: impl FnOnce(&mut Value)) -> Result<VlmConfig> {
+        let mut json = small();
+        change(&mut json);
+        VlmConfig::from_json("config.json", &json)
+    }
+
+    /// What `Qwen2_5_VLConfig` of the reference makes of the same files.
+    #[test]
+    fn keys_that_stand_twice_or_are_null_count_as_in_the_reference() {
+        let rope = json!({"rope_type": "default", "rope_theta": 5.0, "mrope_section": [2, 1, 1]});
+        let both = read(|c| c["rope_parameters"] = rope.clone()).unwrap().text;
+        assert_eq!((both.rope_theta, both.mrope_section), (20000.0, [1, 2, 1]));
+        let newer = read(|c| {
+            c["rope_parameters"] = rope.clone();
+            c["rope_scaling"] = Value::Null;
+        });
+        let newer = newer.unwrap().text;
+        assert_eq!((newer.rope_theta, newer.mrope_section), (5.0, [2, 1, 1]));
+        assert_eq!(read(|c| c["num_key_value_heads"] = Value::Null).unwrap().text.kv_heads, 6);
+        let error = read(|c| c["rope_scaling"]["rope_type"] = json!("yarn")).unwrap_err().to_string();
+        assert!(error.contains("rope_scaling.type"), "{error}");
+    }
+
+    #[test]
+    fn the_head_is_tied_if_either_place_says_so() {
+        for (outer, inner, tied) in [
+            (json!(false), json!(true), true),
+            (json!(true), json!(false), true),
+            (Value::Null, json!(true), true),
+            (Value::Null, Value::Null, false),
+        ] {
+            let read = read(|c| {
+                c["text_config"] = c.clone();
+                c["text_config"]["tie_word_embeddings"] = inner.clone();
+                c["tie_word_embeddings"] = outer.clone();
+            });
+            assert_eq!(read.unwrap().text.tie_word_embeddings, tied, "{outer} {inner}");
+        }
+    }
 }

@@ -40,33 +40,55 @@ pub struct Pixels {
     pub grid: Grid,
 }
 
+/// Refuses a file that asks for other steps than resizing (bicubic), rescaling (to 0..1) and normalising.
+fn published_steps(file: &str, json: &Value) -> Result<()> {
+    let check = |key: &str, fits: fn(&Value) -> bool, expected: &str| match json.get(key) {
+        None | Some(Value::Null) => Ok(()),
+        Some(value) if fits(value) => Ok(()),
+        Some(value) => Err(Error::config(file, key, value.to_string(), expected)),
+    };
+    for key in ["do_resize", "do_rescale", "do_normalize", "do_convert_rgb"] {
+        check(key, |v| v == true, "true")?;
+    }
+    // Pillow's number of the filter.
+    check("resample", |v| v.as_u64() == Some(3), "3 (bicubic)")?;
+    let byte = |v: &Value| v.as_f64().is_some_and(|f| (f * 255.0 - 1.0).abs() < 1e-6);
+    check("rescale_factor", byte, "1/255")
+}
+
 impl PreprocessorConfig {
-    /// Reads `preprocessor_config.json`; both `min_pixels`/`max_pixels` and `size.shortest_edge`/`size.longest_edge`.
+    /// Reads `preprocessor_config.json`. As in the reference, `min_pixels` and `max_pixels` each go before
+    /// `size.shortest_edge` and `size.longest_edge`; a `size` that is there has no defaults for its edges.
     ///
     /// # Errors
-    /// [`Error::Config`] names the key.
+    /// [`Error::Config`] names the key that is missing, has a wrong value, or asks for other steps than the published
+    /// ones.
     pub fn from_json(file: &str, json: &Value) -> Result<Self> {
+        published_steps(file, json)?;
         let n = Node::new(file, "", json);
-        let size = json.get("size").cloned().unwrap_or(Value::Null);
-        let size = Node::new(file, "size", &size);
-        let limit = |key: &str, edge: &str, default: usize| {
-            if n.absent(key) { size.size_or(edge, default) } else { n.size(key) }
+        let none = Value::Null;
+        let size = Node::new(file, "size", json.get("size").unwrap_or(&none));
+        let limit = |key: &str, edge: &str, default: usize| match (n.absent(key), n.absent("size")) {
+            (false, _) => n.size(key),
+            (true, true) => Ok(default),
+            (true, false) => size.size(edge),
         };
-        let channels = |key: &str, default: [f32; 3]| -> Result<[f32; 3]> {
+        let channels = |key: &str, default: [f32; 3], least: f32, expected: &str| -> Result<[f32; 3]> {
             let Some(value) = json.get(key) else { return Ok(default) };
             let parsed: Option<[f32; 3]> = serde_json::from_value(value.clone()).ok();
             parsed
-                .filter(|v| v.iter().all(|x| x.is_finite() && *x > 0.0))
-                .ok_or_else(|| Error::config(file, key, value.to_string(), "three positive numbers"))
+                .filter(|v| v.iter().all(|x| x.is_finite() && *x >= least))
+                .ok_or_else(|| Error::config(file, key, value.to_string(), expected))
         };
+        let (mean, deviation) = ([0.48145466, 0.4578275, 0.40821073], [0.26862954, 0.261_302_6, 0.275_777_1]);
         let config = Self {
             min_pixels: limit("min_pixels", "shortest_edge", 56 * 56)?,
             max_pixels: limit("max_pixels", "longest_edge", 28 * 28 * 1280)?,
             patch_size: n.size_or("patch_size", 14)?,
             temporal_patch_size: n.size_or("temporal_patch_size", 2)?,
             merge_size: n.size_or("merge_size", 2)?,
-            image_mean: channels("image_mean", [0.48145466, 0.4578275, 0.40821073])?,
-            image_std: channels("image_std", [0.26862954, 0.261_302_6, 0.275_777_1])?,
+            image_mean: channels("image_mean", mean, 0.0, "three numbers of 0 or more")?,
+            image_std: channels("image_std", deviation, f32::MIN_POSITIVE, "three positive numbers")?,
         };
         if config.min_pixels > config.max_pixels {
             let found = config.min_pixels.to_string();

@@ -7,12 +7,16 @@ use sdim::vlm::rope::RopeLayout;
 use sdim::vlm::weights::Weights;
 use std::collections::{BTreeMap, HashMap};
 
-/// Uniform in -1 to 1; the mixing is the finaliser of MurmurHash3.
-fn unit(index: u32, seed: u32) -> f32 {
-    let mut x = index.wrapping_mul(0x9E37_79B1).wrapping_add(seed);
+/// The finaliser of MurmurHash3.
+pub fn mix(mut x: u32) -> u32 {
     x = (x ^ (x >> 16)).wrapping_mul(0x85EB_CA6B);
     x = (x ^ (x >> 13)).wrapping_mul(0xC2B2_AE35);
-    x ^= x >> 16;
+    x ^ (x >> 16)
+}
+
+/// Uniform in -1 to 1.
+fn unit(index: u32, seed: u32) -> f32 {
+    let x = mix(index.wrapping_mul(0x9E37_79B1).wrapping_add(seed));
     (x >> 8) as f32 * 2f32.powi(-23) - 1.0
 }
 
