@@ -2,8 +2,10 @@
 
 use std::path::{Path, PathBuf};
 
-use hdf5_reader::{Datatype, Hdf5File, OpenOptions, SliceInfo, SliceInfoElem};
+use hdf5_reader::error::Error as Hdf5Error;
+use hdf5_reader::{Datatype, FilterRegistry, Hdf5File, OpenOptions, SliceInfo, SliceInfoElem};
 
+use super::lzf;
 use crate::error::{Error, Result};
 
 /// Largest array read at once, bytes: a picture of 16 megapixels in f64.
@@ -21,8 +23,12 @@ impl Numbers {
     pub(super) fn open(path: &Path) -> Result<Self> {
         // Opening by the crate reports an absent file without its name.
         let size = std::fs::metadata(path).map_err(Error::io(path))?.len();
-        let options =
-            OpenOptions { max_read_bytes: LARGEST_READ, max_chunk_bytes: LARGEST_READ, ..Default::default() };
+        let options = OpenOptions {
+            max_read_bytes: LARGEST_READ,
+            max_chunk_bytes: LARGEST_READ,
+            filter_registry: Some(filters()),
+            ..Default::default()
+        };
         let file = Hdf5File::open_with_options(path, options);
         let file = file.map_err(|e| Error::format(path, e.to_string(), "an HDF5 file"))?;
         Ok(Self { path: path.to_path_buf(), file, size })
@@ -71,6 +77,14 @@ impl Numbers {
             "8-bit `rgb` or `img`, floating-point depth",
         )
     }
+}
+
+fn filters() -> FilterRegistry {
+    let mut filters = FilterRegistry::new();
+    let unpack = |data: &[u8]| lzf::unpack(data, LARGEST_READ);
+    let damaged = || Hdf5Error::DecompressionError("damaged LZF data".to_string());
+    filters.register(lzf::FILTER, Box::new(move |_, data, _| unpack(data).ok_or_else(damaged)));
+    filters
 }
 
 fn selection(axes: usize, index: Option<usize>) -> SliceInfo {

@@ -14,6 +14,7 @@ mod folder;
 mod hdf5;
 mod ibims;
 mod kitti;
+mod lzf;
 mod mat;
 mod nyu;
 pub mod outliers;

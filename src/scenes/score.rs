@@ -1,6 +1,6 @@
 //! Scores of the model and of classical interpolation on one frame.
 
-use super::patterns::sample_points;
+use super::patterns::SparsePattern;
 use crate::benchmarks::Sample;
 use crate::complete::{CompleteOptions, DepthCompleter};
 use crate::depth::metrics::{Errors, errors};
@@ -15,13 +15,7 @@ pub const METHODS: [&str; 3] = ["sdim", "nearest", "linear"];
 /// # Errors
 /// [`crate::Error::NoMeasurement`] if the ground truth is empty.
 pub fn measurements(sample: &Sample, points: usize, seed: u64) -> Result<SparseDepth> {
-    match &sample.sparse {
-        Some(sparse) => Ok(sparse.clone()),
-        None => {
-            let (w, h) = (sample.rgb.width() as usize, sample.rgb.height() as usize);
-            sample_points(&sample.gt, w, h, points, seed)
-        }
-    }
+    sample.measurements(points, SparsePattern::Uniform, seed)
 }
 
 /// Errors of each of [`METHODS`] over ground-truth pixels that were not given as input.

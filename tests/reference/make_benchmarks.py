@@ -23,12 +23,14 @@ from torchvision import transforms
 OUT = pathlib.Path(sys.argv[1] if len(sys.argv) > 1 else pathlib.Path(__file__).parents[1] / "fixtures/benchmarks")
 
 
-def write_h5(path, **arrays):
+def write_h5(path, compression, **arrays):
     path.parent.mkdir(parents=True, exist_ok=True)
     with h5py.File(path, "w") as file:
         for name, array in arrays.items():
             chunks = (1, *array.shape[1:]) if array.ndim == 4 else True
-            file.create_dataset(name, data=array, chunks=chunks, compression="gzip", compression_opts=9, shuffle=True)
+            level = 9 if compression == "gzip" else None
+            options = {"compression": compression, "compression_opts": level, "shuffle": True}
+            file.create_dataset(name, data=array, chunks=chunks, **options)
 
 
 def nyu_frame():
@@ -38,7 +40,7 @@ def nyu_frame():
     depth = (1.25 + (x // 16 * 3 + y // 12 * 5) % 64 / 11).astype(np.float32)
     depth[100:103, 200:300] = 0
     depth[300:340, 411:480] = 0
-    write_h5(OUT / "nyu/val/official/00001.h5", rgb=rgb, depth=depth)
+    write_h5(OUT / "nyu/val/official/00001.h5", "gzip", rgb=rgb, depth=depth)
 
     tail = transforms.Compose([transforms.Resize(240), transforms.CenterCrop((228, 304))])
     small = np.array(tail(Image.fromarray(rgb.transpose(1, 2, 0))))
@@ -62,8 +64,8 @@ def nyu_bundle():
     img = np.stack([x // 4, y // 16, n * 100 + 7], axis=-1).astype(np.uint8)
     gt = (2 + n + (x // 32) / 4)[..., None].astype(np.float32)
     hints = np.where(((x * 31 + y * 17 + n * 5) % 139 == 0)[..., None], gt, 0).astype(np.float32)
-    write_h5(OUT / "nyu_bundle/nyu_img_gt.h5", img=img, gt=gt)
-    write_h5(OUT / "nyu_bundle/nyu_pred_with_500.h5", hints=hints)
+    write_h5(OUT / "nyu_bundle/nyu_img_gt.h5", "gzip", img=img, gt=gt)
+    write_h5(OUT / "nyu_bundle/nyu_pred_with_500.h5", "lzf", hints=hints)
 
 
 def ibims():
@@ -90,7 +92,11 @@ def ibims():
             "mask_wall_paras": np.array([[0.0, 0.0, 1.0, 2.0]]) if k == 0 else np.zeros((0, 0)),
             "name": name,
         }
-        scipy.io.savemat(folder / f"{name}.mat", {"data": data}, do_compression=k == 0)
+        path = folder / f"{name}.mat"
+        scipy.io.savemat(path, {"data": data}, do_compression=k == 0)
+        # The header's text holds the date; the file is to be the same each time.
+        whole = path.read_bytes()
+        path.write_bytes(b"MATLAB 5.0 MAT-file, made up".ljust(116) + whole[116:])
     (OUT / "ibims/imagelist.txt").write_text("office_02\ncorridor_01\n")
 
 
