@@ -131,6 +131,9 @@ impl Settings {
 
     /// DepthLM's way of asking, for a checkpoint that was trained as DepthLM trains Qwen2.5-VL: a mark in the image, its
     /// question, free answers. It neither sees nor is told measurements; they come in by the alignment of the map.
+    ///
+    /// DepthLM scales all images to one focal length (750 or 1000 pixels, by checkpoint) before it draws and asks, so that its
+    /// answers are those of such a camera. A frame is taken as it is here: scale it beforehand.
     pub fn depthlm() -> Self {
         Self {
             template: PromptTemplate::depthlm(),
