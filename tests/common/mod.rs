@@ -208,6 +208,9 @@ pub fn program(name: &str) -> PathBuf {
     if !path.exists() {
         let mut cargo = Command::new(env!("CARGO"));
         cargo.args(["build", "--example", name]).current_dir(env!("CARGO_MANIFEST_DIR"));
+        if cfg!(feature = "hub") {
+            cargo.args(["--features", "hub"]);
+        }
         if profile.ends_with("release") {
             cargo.arg("--release");
         }
