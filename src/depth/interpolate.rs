@@ -11,14 +11,32 @@ use crate::error::Result;
 /// # Errors
 /// [`Error::NoMeasurement`](crate::error::Error::NoMeasurement) for a map without measurements.
 pub fn nearest(sparse: &SparseDepth) -> Result<Vec<f32>> {
+    let width = sparse.width();
+    from_nearest(sparse, |_, (x, y)| sparse.as_slice()[y * width + x])
+}
+
+/// The Euclidean distance of every pixel to the nearest measured one, exact, in pixels: 0 at measured pixels.
+///
+/// # Errors
+/// [`Error::NoMeasurement`](crate::error::Error::NoMeasurement) for a map without measurements.
+pub fn distance(sparse: &SparseDepth) -> Result<Vec<f32>> {
+    let squared = |a: usize, b: usize| a.abs_diff(b) as f64 * a.abs_diff(b) as f64;
+    from_nearest(sparse, |(x, y), (nx, ny)| (squared(x, nx) + squared(y, ny)).sqrt() as f32)
+}
+
+/// A map of values made from each pixel's (x, y) and that of its nearest measurement.
+fn from_nearest(
+    sparse: &SparseDepth,
+    value: impl Fn((usize, usize), (usize, usize)) -> f32 + Sync,
+) -> Result<Vec<f32>> {
     sparse.require_points()?;
     let (width, height) = (sparse.width(), sparse.height());
     let rows = nearest_rows(sparse.as_slice(), width, height);
     let mut out = vec![0.0; width * height];
     out.par_chunks_mut(width).enumerate().for_each(|(y, line)| {
         let found = &rows[y * width..(y + 1) * width];
-        for (pixel, x) in line.iter_mut().zip(nearest_columns(y, found)) {
-            *pixel = sparse.as_slice()[found[x] as usize * width + x];
+        for ((x, pixel), column) in line.iter_mut().enumerate().zip(nearest_columns(y, found)) {
+            *pixel = value((x, y), (column, found[column] as usize));
         }
     });
     Ok(out)

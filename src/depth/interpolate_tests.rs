@@ -40,6 +40,12 @@ fn nearest_agrees_with_brute_force() {
     ] {
         let sparse = scattered(seed, count, w, h);
         check_nearest(&sparse, &nearest(&sparse).unwrap());
+        let far = distance(&sparse).unwrap();
+        for (i, &found) in far.iter().enumerate() {
+            let squared = |p: (usize, usize, f32)| p.0.abs_diff(i % w).pow(2) + p.1.abs_diff(i / w).pow(2);
+            let expected = (sparse.points().map(squared).min().unwrap() as f64).sqrt() as f32;
+            assert_eq!(found, expected, "pixel {i}");
+        }
     }
 }
 

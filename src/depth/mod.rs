@@ -3,7 +3,9 @@
 //! Everywhere in this module depth is Z-depth (along the optical axis) in metres, `f32`, row-major, `width * height`
 //! values; x grows to the right, y grows downwards; a missing value is NaN in memory and 0 in integer files.
 
+pub mod baselines;
 pub mod colour;
+pub mod figure;
 pub mod interpolate;
 mod label;
 mod map;

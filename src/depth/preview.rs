@@ -9,13 +9,13 @@ use super::colour::{self, ColourMap, confidence_to_rgb, depth_to_rgb, error_to_r
 use super::{DepthMap, SparseDepth, check_length, is_valid, label};
 use crate::error::{Error, Result};
 
-const GAP: usize = 8;
-const CAPTION: usize = 24;
-const TEXT_SCALE: usize = 2;
+pub(super) const GAP: usize = 8;
+pub(super) const CAPTION: usize = 24;
+pub(super) const TEXT_SCALE: usize = 2;
 /// Tiles narrower than this are enlarged by a whole factor, so that captions fit and points can be seen.
 const MIN_TILE: usize = 320;
-const BACKGROUND: Rgb<u8> = Rgb([24, 24, 24]);
-const TEXT: Rgb<u8> = Rgb([230, 230, 230]);
+pub(super) const BACKGROUND: Rgb<u8> = Rgb([24, 24, 24]);
+pub(super) const TEXT: Rgb<u8> = Rgb([230, 230, 230]);
 
 /// Draws RGB, measurements, depth and confidence in one picture, and with `truth` (row-major metres) also the ground truth
 /// and the absolute error. All depth tiles share one range, taken from the truth if given, else from the dense map; the scale
@@ -122,7 +122,7 @@ impl Tile {
 }
 
 /// Three digits are enough to read a scale.
-fn number(value: f32) -> String {
+pub(super) fn number(value: f32) -> String {
     if value >= 10.0 {
         format!("{value:.0}")
     } else if value >= 1.0 {
@@ -195,7 +195,7 @@ fn known(dense: &DepthMap) -> Vec<f32> {
     pairs.map(|(&confidence, depth)| if depth.is_nan() { f32::NAN } else { confidence }).collect()
 }
 
-fn absolute_error(depth: &[f32], truth: &[f32]) -> Vec<f32> {
+pub(super) fn absolute_error(depth: &[f32], truth: &[f32]) -> Vec<f32> {
     let error = |(&d, &t): (&f32, &f32)| if is_valid(d) && is_valid(t) { (d - t).abs() } else { f32::NAN };
     depth.iter().zip(truth).map(error).collect()
 }
