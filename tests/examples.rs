@@ -78,36 +78,6 @@ fn complete_writes_nothing_on_bad_input() {
 }
 
 #[test]
-fn evaluate_scores_a_rendered_folder() {
-    let dir = tempfile::tempdir().unwrap();
-    let out =
-        run("render", &["--out", text(dir.path()), "--count", "3", "--width", "160", "--height", "120"]);
-    assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
-    let json = dir.path().join("scores.json");
-    let args = [
-        "--data",
-        text(dir.path()),
-        "--depth-scale",
-        "mm",
-        "--points",
-        "100",
-        "--limit",
-        "2",
-        "--json",
-        text(&json),
-    ];
-    let out = run("evaluate", &args);
-    assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
-    let v: Value = serde_json::from_slice(&std::fs::read(&json).unwrap()).unwrap();
-    assert_eq!(v["frames"], 2);
-    for method in ["sdim", "nearest", "linear"] {
-        for key in ["mae", "rmse", "abs_rel"] {
-            assert!(v["methods"][method][key].as_f64().unwrap() > 0.0, "{method}.{key}");
-        }
-    }
-}
-
-#[test]
 fn train_resumes_and_its_checkpoint_loads() {
     let dir = tempfile::tempdir().unwrap();
     let model = dir.path().join("model");

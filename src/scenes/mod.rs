@@ -10,7 +10,6 @@ mod light;
 mod patterns;
 mod rooms;
 #[cfg(feature = "benchmarks")]
-pub mod score;
 mod shapes;
 mod space;
 mod stage;

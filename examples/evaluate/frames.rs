@@ -1,0 +1,45 @@
+//! Where frames come from.
+
+use crate::Args;
+use sdim::benchmarks::{Dataset, LayoutOptions, Sample};
+use sdim::scenes::procedural;
+
+/// Seeds from here on are never drawn in training with the default configuration.
+const HELD_OUT: u64 = 2_000_000;
+
+/// Opens the data set that the arguments name.
+pub fn open(args: &Args) -> anyhow::Result<Box<dyn Dataset>> {
+    match (&args.data, args.procedural) {
+        (Some(dir), _) => {
+            let mut options = LayoutOptions::default();
+            (options.scale, options.seed, options.range) = (args.depth_scale, args.seed, args.range);
+            Ok(args.layout.open(dir, &options)?)
+        }
+        (None, Some(0) | None) => anyhow::bail!("--procedural 0: expected at least 1 scene"),
+        (None, Some(count)) => Ok(Box::new(Procedural(count))),
+    }
+}
+
+/// Scenes that training never saw.
+struct Procedural(usize);
+
+impl Dataset for Procedural {
+    fn len(&self) -> usize {
+        self.0
+    }
+
+    fn name(&self, index: usize) -> String {
+        format!("scene-{index}")
+    }
+
+    fn load(&self, index: usize) -> sdim::Result<Sample> {
+        let frame = procedural(HELD_OUT + index as u64, 320, 240)?;
+        Ok(Sample {
+            name: self.name(index),
+            rgb: frame.rgb,
+            gt: frame.depth,
+            sparse: None,
+            masks: Vec::new(),
+        })
+    }
+}

@@ -1,0 +1,167 @@
+//! Scores checkpoints and classical baselines on a data set of RGB-D frames: the paper's Tables 2 and 4 on your own copy.
+//!
+//! `cargo run --release --example evaluate -- --layout folder --data DIR --points 100,500 --out RESULTS`
+//!
+//! Errors are over ground-truth pixels that were not given as input. Each frame's scores are one small file under `--out`, so a run
+//! that was stopped goes on where it was, and `--shard I/N` spreads a data set over machines; `--merge` makes one report of them.
+//! report.md, report.json and frames.csv depend on the scores alone and are the same, byte for byte, however the work was divided;
+//! times and memory stand in speed.json and are printed to stderr.
+
+#[path = "../common/mod.rs"]
+mod common;
+mod figures;
+mod frames;
+mod methods;
+mod record;
+mod report;
+mod run;
+mod settings;
+mod speed;
+
+use anyhow::{Context, bail};
+use clap::Parser;
+use sdim::benchmarks::Layout;
+use sdim::scenes::SparsePattern;
+use sdim::{DepthScale, QueryPlan};
+use std::path::PathBuf;
+use std::str::FromStr;
+
+/// Scores checkpoints and classical baselines on RGB-D frames.
+///
+/// Results under --out: settings.json, frames/POINTS/INDEX.json (one per frame and number of points, written whole or not at all);
+/// report.md, report.json, frames.csv (the same bytes however the work was divided or interrupted); speed.json (times and memory, which
+/// differ from run to run).
+#[derive(Parser)]
+pub struct Args {
+    /// How the data set is stored: folder, nyu, void, ibims, kitti, ddad, tum, as far as this build reads them.
+    #[arg(long, default_value = "folder")]
+    layout: Layout,
+    /// The data set.
+    #[arg(long, required_unless_present_any = ["procedural", "merge"])]
+    data: Option<PathBuf>,
+    /// Score on this many held-out procedural scenes of 320x240 instead.
+    #[arg(long, conflicts_with = "data")]
+    procedural: Option<usize>,
+    /// Unit of integer depth files of layout folder: mm, kitti, tum or units per metre.
+    #[arg(long)]
+    depth_scale: Option<DepthScale>,
+    /// Nearest and farthest ground truth that counts, metres: NEAR,FAR.
+    #[arg(long, value_parser = pair)]
+    range: Option<(f32, f32)>,
+    /// Points drawn from the ground truth where a frame has no measurements of its own; several: 100,500,1500. Default: what
+    /// the benchmark's protocol says, else 500.
+    #[arg(long, value_delimiter = ',')]
+    points: Vec<usize>,
+    /// How they are spread: uniform, lidar:LINES or sfm.
+    #[arg(long, default_value = "uniform")]
+    pattern: String,
+    /// Seed of the drawn points.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Only the first frames.
+    #[arg(long)]
+    limit: Option<usize>,
+    /// `tiny` (the default) or a checkpoint directory; may be given several times.
+    #[arg(long, visible_alias = "model")]
+    checkpoint: Vec<String>,
+    /// Adapter directory on top of the one --checkpoint.
+    #[arg(long)]
+    adapter: Option<PathBuf>,
+    /// Only these methods: names of baselines and checkpoints as in the table. Memory per method is that of the whole process with
+    /// all checkpoints loaded, so name one method to see what it needs alone.
+    #[arg(long, value_delimiter = ',')]
+    methods: Vec<String>,
+    /// Pixels to ask: every, stride:N or budget:N.
+    #[arg(long, default_value_t = Default::default())]
+    plan: QueryPlan,
+    /// cpu, cuda:N or metal.
+    #[arg(long, default_value = "cpu")]
+    device: String,
+    /// Where results go and are taken up from. Without it nothing is kept.
+    #[arg(long)]
+    out: Option<PathBuf>,
+    /// Only every N-th frame, from the I-th on, I from 0 to N-1 (as in SLURM_ARRAY_TASK_ID); needs --out, and --merge afterwards.
+    #[arg(long, requires = "out", value_name = "I/N")]
+    shard: Option<Shard>,
+    /// Make the report of finished runs or shards instead of running; into --out if given.
+    #[arg(long, num_args = 1.., value_name = "DIR", conflicts_with_all = ["data", "procedural", "shard", "figures"])]
+    merge: Vec<PathBuf>,
+    /// Draw the first frames into this folder, all methods and their errors beside each other.
+    #[arg(long)]
+    figures: Option<PathBuf>,
+    /// How many frames to draw.
+    #[arg(long, default_value_t = 10)]
+    figure_frames: usize,
+    /// Width of one picture in a figure, pixels.
+    #[arg(long, default_value_t = 320)]
+    figure_tile: usize,
+    /// Print the report as one JSON object instead of tables.
+    #[arg(long)]
+    json: bool,
+    /// Print each frame's MAE of each method to stderr.
+    #[arg(long)]
+    verbose: bool,
+}
+
+/// A part of the frames: those whose index leaves `index` when divided by `of`.
+#[derive(Clone, Copy, Debug)]
+pub struct Shard {
+    pub index: usize,
+    pub of: usize,
+}
+
+impl FromStr for Shard {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let parts = text.split_once('/').and_then(|(i, n)| Some((i.parse().ok()?, n.parse().ok()?)));
+        match parts {
+            Some((index, of)) if index < of => Ok(Shard { index, of }),
+            _ => Err("expected I/N with I from 0 to N-1".to_string()),
+        }
+    }
+}
+
+fn pair(text: &str) -> Result<(f32, f32), String> {
+    let parts =
+        text.split_once(',').and_then(|(a, b)| Some((a.trim().parse().ok()?, b.trim().parse().ok()?)));
+    parts.ok_or_else(|| "expected NEAR,FAR in metres".to_string())
+}
+
+impl Args {
+    /// What was asked for that the data set does not decide.
+    fn points(&self) -> anyhow::Result<Vec<usize>> {
+        let mut points = self.points.clone();
+        if points.is_empty() {
+            points.push(self.layout.points().unwrap_or(500));
+        }
+        points.sort_unstable();
+        points.dedup();
+        if points[0] == 0 {
+            bail!("--points 0: expected at least 1");
+        }
+        Ok(points)
+    }
+
+    fn pattern(&self) -> anyhow::Result<SparsePattern> {
+        self.pattern.parse().context("--pattern")
+    }
+}
+
+fn main() -> anyhow::Result<()> {
+    let args = Args::parse();
+    sdim::kernels::keep_freed_memory();
+    let made =
+        if args.merge.is_empty() { run::run(&args)? } else { Some(report::Report::read(&args.merge)?) };
+    let Some(report) = made else { return Ok(()) };
+    if let Some(out) = &args.out {
+        report.write(out)?;
+    }
+    if args.json {
+        println!("{}", serde_json::to_string_pretty(&report.tables)?);
+    } else {
+        print!("{}", report.markdown());
+    }
+    eprint!("{}", report.speed.table());
+    Ok(())
+}

@@ -1,0 +1,118 @@
+//! The tables as Markdown.
+
+use super::{MethodTable, Table, Tables};
+use sdim::depth::metrics::{Interval, METRICS, Metric};
+use std::fmt::Write;
+
+/// Metrics with intervals in the first table; the others follow without.
+const MAIN: [&str; 4] = ["mae", "rmse", "abs_rel", "delta_1.25"];
+
+pub fn markdown(report: &Tables) -> String {
+    let s = &report.settings;
+    let mut text = format!(
+        "# Evaluation\n\n{} frames of layout {}, pattern {} where sampled, seed {}, plan {}. Means over frames, in brackets 95 % \
+         bootstrap intervals over frames; errors over pixels with ground truth that were not measured.\n",
+        s.frames, s.layout, s.pattern, s.seed, s.plan
+    );
+    report.tables.iter().for_each(|t| table(&mut text, t));
+    text
+}
+
+fn table(text: &mut String, t: &Table) {
+    let _ = writeln!(
+        text,
+        "\n## {} points\n\n{} frames, {:.0} measured pixels in the mean.",
+        t.points, t.frames, t.measured
+    );
+    if !t.skipped.is_empty() {
+        let _ = writeln!(
+            text,
+            "\nNot scored, for want of ground truth or measurements: {}.",
+            t.skipped.join(", ")
+        );
+    }
+    if t.methods.is_empty() {
+        return;
+    }
+    let (main, others): (Vec<&Metric>, Vec<&Metric>) = METRICS.iter().partition(|m| MAIN.contains(&m.name));
+    let columns = main.iter().map(|m| metric(t, m, true)).chain([ratio(t)]);
+    rows(text, t, columns.collect());
+    let gradient = plain("GE m", t, false, |m| m.gradient_error.map(|g| g.value));
+    rows(text, t, others.iter().map(|m| metric(t, m, false)).chain([gradient]).collect());
+    let regions = t.methods.first().map_or(&[][..], |m| &m.regions);
+    let by_region = regions.iter().filter(|r| r.frames > 0).map(|r| {
+        plain(&format!("MAE {}", r.name), t, false, |m| {
+            m.regions.iter().find(|found| found.name == r.name).map(|found| found.mae)
+        })
+    });
+    rows(text, t, by_region.collect());
+    let sure: Vec<&MethodTable> = t.methods.iter().filter(|m| !m.confidence.is_empty()).collect();
+    if let Some(first) = sure.first() {
+        let names: Vec<&String> = first.confidence.keys().collect();
+        let heads: Vec<String> = names.iter().map(|n| n.replace('_', " ")).collect();
+        let _ =
+            writeln!(text, "\n| confidence | {} |\n|---|{}", heads.join(" | "), "---|".repeat(names.len()));
+        for m in sure {
+            let values: Vec<String> = names.iter().map(|n| digits(m.confidence.get(*n).copied())).collect();
+            let _ = writeln!(text, "| {} | {} |", m.name, values.join(" | "));
+        }
+    }
+}
+
+/// A heading and one cell per method.
+type Column = (String, Vec<String>);
+
+fn rows(text: &mut String, t: &Table, columns: Vec<Column>) {
+    let heads: Vec<&str> = columns.iter().map(|c| c.0.as_str()).collect();
+    let _ = writeln!(text, "\n| method | {} |\n|---|{}", heads.join(" | "), "---|".repeat(heads.len()));
+    for (row, m) in t.methods.iter().enumerate() {
+        let cells: Vec<&str> = columns.iter().map(|c| c.1[row].as_str()).collect();
+        let _ = writeln!(text, "| {} | {} |", m.name, cells.join(" | "));
+    }
+}
+
+fn metric(t: &Table, metric: &Metric, intervals: bool) -> Column {
+    let of = |m: &MethodTable| m.metrics.get(metric.name).copied();
+    let (head, mut cells) = plain(metric.label, t, metric.higher_is_better, |m| of(m).map(|i| i.value));
+    if intervals {
+        cells.iter_mut().zip(&t.methods).for_each(|(cell, m)| cell.push_str(&brackets(of(m))));
+    }
+    (head, cells)
+}
+
+fn ratio(t: &Table) -> Column {
+    let head = format!("MAE : {}", t.reference);
+    let cell = |m: &MethodTable| match m.mae_ratio {
+        Some(i) if m.name != t.reference => format!("{:.2} ({:.2} to {:.2})", i.value, i.low, i.high),
+        _ => String::new(),
+    };
+    (head, t.methods.iter().map(cell).collect())
+}
+
+/// The best value in bold.
+fn plain(head: &str, t: &Table, higher: bool, value: impl Fn(&MethodTable) -> Option<f64>) -> Column {
+    let values: Vec<Option<f64>> = t.methods.iter().map(value).collect();
+    let better = |a: f64, b: f64| if higher { a.max(b) } else { a.min(b) };
+    let best = values.iter().copied().flatten().reduce(better);
+    let cell = |v: &Option<f64>| match v {
+        // As written: values that look the same are equally good.
+        Some(_) if values.len() > 1 && digits(*v) == digits(best) => format!("**{}**", digits(*v)),
+        _ => digits(*v),
+    };
+    (head.to_string(), values.iter().map(cell).collect())
+}
+
+fn brackets(interval: Option<Interval>) -> String {
+    interval.map_or(String::new(), |i| format!(" ({} to {})", digits(Some(i.low)), digits(Some(i.high))))
+}
+
+/// Three decimals, four for small values, fewer for large ones.
+fn digits(value: Option<f64>) -> String {
+    match value {
+        None => "-".to_string(),
+        Some(v) if v.abs() >= 100.0 => format!("{v:.0}"),
+        Some(v) if v.abs() >= 10.0 => format!("{v:.1}"),
+        Some(v) if v.abs() < 0.1 => format!("{v:.4}"),
+        Some(v) => format!("{v:.3}"),
+    }
+}

@@ -1,0 +1,177 @@
+//! Scores frame after frame. Nothing of a frame stays in memory once its file is written.
+
+use crate::methods::{Answer, Method};
+use crate::record::{self, Confidence, Cost, Record, Scores, read_json, write_json};
+use crate::report::Report;
+use crate::settings::Settings;
+use crate::{Args, Shard, figures, frames, methods, speed};
+use anyhow::Context;
+use indicatif::{ProgressBar, ProgressStyle};
+use sdim::SparseDepth;
+use sdim::benchmarks::{Dataset, Sample, frame_seed};
+use sdim::depth::metrics::{
+    DISTANCE_LIMITS, EdgeRule, Regions, errors, errors_in, gradient_error, score_confidence,
+};
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+/// What the confidence of a map speaks of: truth within 5 % of the answer.
+const CONFIDENT_WITHIN: f64 = 0.05;
+
+/// Runs what is not done yet. The report, unless this was a shard of something larger.
+pub fn run(args: &Args) -> anyhow::Result<Option<Report>> {
+    // What is cheap to check comes first: a checkpoint may take minutes to load.
+    args.points()?;
+    args.pattern()?;
+    let frames = frames::open(args)?;
+    let methods = methods::load_all(args)?;
+    let settings = Settings::new(args, frames.as_ref(), &methods)?;
+    // Removed at the end, where nothing is to be kept.
+    let temporary = tempfile::tempdir()?;
+    let out = args.out.clone().unwrap_or_else(|| temporary.path().to_path_buf());
+    settings.enter(&out)?;
+    let shard = args.shard.unwrap_or(Shard { index: 0, of: 1 });
+    let mine: Vec<usize> = (shard.index..settings.frames).step_by(shard.of).collect();
+    let bar = ProgressBar::new((mine.len() * settings.points.len()) as u64);
+    bar.set_style(ProgressStyle::with_template("{bar:40} {pos}/{len} frames, {eta} left {msg}")?);
+    for index in mine {
+        for &points in &settings.points {
+            let task = Task { args, methods: &methods, frames: frames.as_ref(), index, points };
+            bar.set_message(frames.name(index));
+            if let Some(line) = task.finish(&out)? {
+                bar.suspend(|| eprintln!("{line}"));
+            }
+            bar.inc(1);
+        }
+    }
+    bar.finish_and_clear();
+    if shard.of > 1 {
+        let n = (shard.index..settings.frames).step_by(shard.of).count();
+        eprintln!(
+            "shard {}/{}: {n} frames done; when all are, --merge makes the report",
+            shard.index, shard.of
+        );
+        return Ok(None);
+    }
+    Report::read(&[out]).map(Some)
+}
+
+/// One frame with one number of points.
+struct Task<'a> {
+    args: &'a Args,
+    methods: &'a [Method],
+    frames: &'a dyn Dataset,
+    index: usize,
+    points: usize,
+}
+
+impl Task<'_> {
+    fn figure(&self) -> Option<PathBuf> {
+        let dir = self.args.figures.as_ref().filter(|_| self.index < self.args.figure_frames)?;
+        Some(dir.join(format!("{}-{}.png", self.frames.name(self.index), self.points)))
+    }
+
+    /// Makes the frame's file unless it is there; a line to show, if wanted.
+    fn finish(&self, out: &Path) -> anyhow::Result<Option<String>> {
+        let path = record::path(out, self.points, self.index);
+        let figure = self.figure().filter(|f| !f.exists());
+        if figure.is_none() && read_json::<Record>(&path)?.is_some() {
+            return Ok(None);
+        }
+        let name = self.frames.name(self.index);
+        let record = self.score(figure.as_deref()).with_context(|| format!("frame {name}"))?;
+        write_json(&path, &record)?;
+        let maes = record.scores.iter().map(|s| format!("{} {:.4}", s.method, s.errors.mae));
+        let line = maes.collect::<Vec<_>>().join("  ");
+        Ok(match &record.skipped {
+            Some(reason) => Some(format!("{name}, {} points: skipped: {reason}", self.points)),
+            None => self.args.verbose.then(|| format!("{name}, {} points: MAE {line}", self.points)),
+        })
+    }
+
+    fn score(&self, figure: Option<&Path>) -> anyhow::Result<Record> {
+        let sample = self.frames.load(self.index)?;
+        let (width, height) = (sample.rgb.width() as usize, sample.rgb.height() as usize);
+        let mut record = Record {
+            index: self.index,
+            name: sample.name.clone(),
+            width,
+            height,
+            measured: 0,
+            skipped: None,
+            scores: Vec::new(),
+            cost: Vec::new(),
+        };
+        if !sample.gt.iter().any(|d| d.is_finite() && *d > 0.0) {
+            record.skipped = Some("no ground truth".to_string());
+            return Ok(record);
+        }
+        let seed = frame_seed(self.args.seed, self.index);
+        let sparse = sample.measurements(self.points, self.args.pattern()?, seed)?;
+        record.measured = sparse.measured();
+        let to_score = |(t, s): (&f32, &f32)| t.is_finite() && *t > 0.0 && s.is_nan();
+        if sparse.measured() == 0 || !sample.gt.iter().zip(sparse.as_slice()).any(to_score) {
+            record.skipped = Some("no measurement, or none left to predict".to_string());
+            return Ok(record);
+        }
+        let regions = regions(&sample, &sparse)?;
+        let mut drawn = Vec::new();
+        for method in self.methods {
+            let (answer, cost) = measure(|| method.complete(&sample.rgb, &sparse))?;
+            record.scores.push(judge(method, &answer, &sample, &sparse, &regions)?);
+            record.cost.push(cost);
+            if figure.is_some() {
+                drawn.push((method.name.clone(), answer.depth().to_vec()));
+            }
+        }
+        if let Some(path) = figure {
+            figures::write(path, &sample, &sparse, &drawn, self.args.figure_tile)?;
+        }
+        Ok(record)
+    }
+}
+
+fn measure(work: impl FnOnce() -> sdim::Result<Answer>) -> anyhow::Result<(Answer, Cost)> {
+    speed::forget_peak();
+    let start = Instant::now();
+    let answer = work()?;
+    let seconds = start.elapsed().as_secs_f64();
+    Ok((answer, Cost { seconds, peak_bytes: sdim::system::peak_rss_bytes() }))
+}
+
+/// The frame taken apart: by distance, at edges, and by the masks that the data set has.
+fn regions(sample: &Sample, sparse: &SparseDepth) -> sdim::Result<Vec<Regions>> {
+    let mut all = vec![
+        Regions::by_distance(sparse, &DISTANCE_LIMITS)?,
+        Regions::at_edges(&sample.gt, sparse, &EdgeRule::default())?,
+    ];
+    for mask in &sample.masks {
+        all.push(Regions::by_mask(mask.name, &mask.pixels, sparse)?);
+    }
+    Ok(all)
+}
+
+fn judge(
+    method: &Method,
+    answer: &Answer,
+    sample: &Sample,
+    sparse: &SparseDepth,
+    regions: &[Regions],
+) -> anyhow::Result<Scores> {
+    let (depth, truth) = (answer.depth(), &sample.gt);
+    let mut by_region = Vec::new();
+    for regions in regions {
+        by_region.extend(regions.names().iter().cloned().zip(errors_in(depth, truth, regions)?));
+    }
+    let confidence = match answer {
+        Answer::Map(map) => Some(Confidence::from(score_confidence(map, truth, CONFIDENT_WITHIN)?)),
+        Answer::Depth(_) => None,
+    };
+    Ok(Scores {
+        method: method.name.clone(),
+        errors: errors(depth, truth, sparse).with_context(|| method.name.clone())?,
+        gradient_error: gradient_error(depth, truth, sparse.width(), sparse.height())?,
+        regions: by_region,
+        confidence,
+    })
+}
