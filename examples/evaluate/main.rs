@@ -33,7 +33,7 @@ use std::str::FromStr;
 /// differ from run to run).
 #[derive(Parser)]
 pub struct Args {
-    /// How the data set is stored: folder, nyu, void, ibims, kitti, ddad, tum, as far as this build reads them.
+    /// How the data set is stored: folder, nyu, void, ibims, kitti, ddad, tum or scannet.
     #[arg(long, default_value = "folder")]
     layout: Layout,
     /// The data set.

@@ -19,6 +19,8 @@ pub struct Record {
     pub height: usize,
     /// Pixels that were measured.
     pub measured: usize,
+    /// Whether they came with the data set and were not drawn.
+    pub own: bool,
     /// Why the frame cannot be scored, if it cannot; there are no scores then.
     pub skipped: Option<String>,
     /// By method, in the order of the table.

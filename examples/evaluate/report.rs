@@ -33,6 +33,8 @@ pub struct Table {
     pub skipped: Vec<String>,
     /// Mean number of measured pixels.
     pub measured: f64,
+    /// Frames whose measurements came with the data set, whatever `points` says.
+    pub own: usize,
     /// The method that `mae_ratio` compares with.
     pub reference: String,
     pub methods: Vec<MethodTable>,
@@ -164,6 +166,7 @@ struct Sums {
     frames: usize,
     skipped: Vec<String>,
     measured: usize,
+    own: usize,
     methods: Vec<Values>,
 }
 
@@ -175,6 +178,7 @@ impl Sums {
         }
         self.frames += 1;
         self.measured += record.measured;
+        self.own += usize::from(record.own);
         for scores in record.scores {
             let at = self.methods.iter().position(|m| m.name == scores.method).unwrap_or_else(|| {
                 self.methods.push(Values { name: scores.method.clone(), ..Values::default() });
@@ -192,6 +196,7 @@ impl Sums {
             frames: self.frames,
             skipped: self.skipped.clone(),
             measured: self.measured as f64 / self.frames.max(1) as f64,
+            own: self.own,
             reference: reference.map_or(String::new(), |r| r.name.clone()),
             methods: (settings.methods.iter())
                 .filter_map(|(name, _)| Some(named(name)?.table(reference?)))

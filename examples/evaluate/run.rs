@@ -98,6 +98,7 @@ impl Task<'_> {
             width,
             height,
             measured: 0,
+            own: sample.sparse.is_some(),
             skipped: None,
             scores: Vec::new(),
             cost: Vec::new(),

@@ -19,11 +19,13 @@ pub fn markdown(report: &Tables) -> String {
 }
 
 fn table(text: &mut String, t: &Table) {
-    let _ = writeln!(
-        text,
-        "\n## {} points\n\n{} frames, {:.0} measured pixels in the mean.",
-        t.points, t.frames, t.measured
-    );
+    let title = match t.own {
+        own if own > 0 && own == t.frames => "The data set's own measurements".to_string(),
+        0 => format!("{} points", t.points),
+        own => format!("{} points ({own} frames: their own measurements)", t.points),
+    };
+    let _ =
+        writeln!(text, "\n## {title}\n\n{} frames, {:.0} measured pixels in the mean.", t.frames, t.measured);
     if !t.skipped.is_empty() {
         let _ = writeln!(
             text,
