@@ -4,7 +4,7 @@ use super::lora::{Lora, LoraMode};
 use super::matrix::Matrix;
 use super::weights::Weights;
 use crate::error::Result;
-use crate::kernels;
+use crate::kernels::{self, PackedGate};
 use candle_core::Tensor;
 
 /// `x W^T + b`, weight `[out, in]`, and a low-rank addition where an adapter has one.
@@ -69,10 +69,15 @@ impl RmsNorm {
     }
 }
 
+/// The two projections of a gated MLP that read the same input.
+enum GateUp {
+    Apart { gate: Linear, up: Linear },
+    Joined(PackedGate),
+}
+
 /// `down(silu(gate x) * up x)`, the MLP of both towers.
 pub struct GatedMlp {
-    gate: Linear,
-    up: Linear,
+    inputs: GateUp,
     down: Linear,
 }
 
@@ -82,11 +87,15 @@ impl GatedMlp {
     /// # Errors
     /// As [`Weights::get`].
     pub fn new(weights: &Weights, name: &str, width: usize, inner: usize, bias: bool) -> Result<Self> {
-        Ok(Self {
-            gate: Linear::new(weights, &format!("{name}.gate_proj"), width, inner, bias)?,
-            up: Linear::new(weights, &format!("{name}.up_proj"), width, inner, bias)?,
-            down: Linear::new(weights, &format!("{name}.down_proj"), inner, width, bias)?,
-        })
+        let gate = Linear::new(weights, &format!("{name}.gate_proj"), width, inner, bias)?;
+        let up = Linear::new(weights, &format!("{name}.up_proj"), width, inner, bias)?;
+        let inputs = match ((&gate.weight, &gate.lora), (&up.weight, &up.lora)) {
+            ((Matrix::Packed(g), None), (Matrix::Packed(u), None)) => {
+                GateUp::Joined(PackedGate::new((g, gate.bias.as_ref()), (u, up.bias.as_ref()))?)
+            }
+            _ => GateUp::Apart { gate, up },
+        };
+        Ok(Self { inputs, down: Linear::new(weights, &format!("{name}.down_proj"), inner, width, bias)? })
     }
 
     /// `[n, width]` to the same.
@@ -94,6 +103,10 @@ impl GatedMlp {
     /// # Errors
     /// [`crate::Error::Tensors`] on another width.
     pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
-        self.down.forward(&kernels::swiglu(&self.gate.forward(x)?, &self.up.forward(x)?)?)
+        let gated = match &self.inputs {
+            GateUp::Apart { gate, up } => kernels::swiglu(&gate.forward(x)?, &up.forward(x)?)?,
+            GateUp::Joined(both) => both.apply(x)?,
+        };
+        self.down.forward(&gated)
     }
 }
