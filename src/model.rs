@@ -15,6 +15,7 @@ use crate::vlm::generate::GenerationConfig;
 use crate::vlm::grid::Grid;
 use crate::vlm::linear::Linear;
 use crate::vlm::lora::LoraMode;
+use crate::vlm::matrix::Matrix;
 use crate::vlm::patch_embed::PatchEmbed;
 use crate::vlm::preprocess::{Pixels, PreprocessorConfig};
 use crate::vlm::tokenizer::Tokenizer;
@@ -50,7 +51,7 @@ pub struct SdimModel {
     /// Ids that end a free answer.
     pub stop_ids: Vec<u32>,
     /// Rows of the output head that can continue a number, `[numbers, hidden]`.
-    pub number_rows: Tensor,
+    pub number_rows: Matrix,
     /// Where its tensors are.
     pub device: Device,
 }
@@ -183,6 +184,7 @@ impl SdimModel {
         let Parts { vlm, injection, glimpse } = Parts::new(config, &settings, weights)?;
         weights.finish()?;
         let number_rows = vlm.decoder.head_rows(&prompts.numbers().ids)?;
+        let number_rows = Matrix::from_tensor(&number_rows, None, weights.format())?;
         Ok(Self {
             vlm,
             injection,

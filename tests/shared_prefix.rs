@@ -124,7 +124,7 @@ impl Setup {
     fn logits(&self, hidden: &Tensor) -> Vec<f32> {
         let last = hidden.narrow(0, hidden.dim(0).unwrap() - 1, 1).unwrap();
         let normed = self.model.vlm.decoder.final_norm(&last).unwrap();
-        linear(&normed, &self.model.number_rows, None).unwrap().flatten_all().unwrap().to_vec1().unwrap()
+        self.model.number_rows.linear(&normed, None).unwrap().flatten_all().unwrap().to_vec1().unwrap()
     }
 
     /// The answer to one query, each of its tokens read in a run of its own from the first token on.

@@ -9,7 +9,6 @@ use super::prefix::Prefix;
 use super::prompt::{Glimpse, Query, Tokens};
 use super::settings::PixelReference;
 use crate::error::{Error, Result};
-use crate::kernels;
 use crate::model::SdimModel;
 use crate::vlm::cache::KvCache;
 use crate::vlm::decoder::{Context, Keep};
@@ -227,7 +226,7 @@ impl<'a> Batch<'a> {
 
     /// The number rows of the output head, `[items, numbers]`.
     fn number_logits(&self) -> Result<Vec<f32>> {
-        let logits = kernels::linear(&self.last, &self.model.number_rows, None)?;
+        let logits = self.model.number_rows.linear(&self.last, None)?;
         Ok(logits.flatten_all()?.to_vec1()?)
     }
 }

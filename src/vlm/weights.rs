@@ -143,6 +143,11 @@ impl Weights {
         self
     }
 
+    /// In what form matrices are kept.
+    pub fn format(&self) -> WeightFormat {
+        self.format
+    }
+
     /// Says which linear layers carry LoRA factors, and whether they are merged into the weight.
     pub fn with_lora(mut self, lora: LoraSet) -> Self {
         self.lora = lora;
