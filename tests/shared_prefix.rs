@@ -6,7 +6,7 @@ use candle_core::{Device, Tensor};
 use common::{relative_difference, tiny};
 use image::RgbImage;
 use sdim::SparseDepth;
-use sdim::kernels::{Block, linear};
+use sdim::kernels::Block;
 use sdim::model::SdimModel;
 use sdim::query::number::{DepthUnit, DigitReader, NumberFormat, Reading, read_bins};
 use sdim::query::prompt::Tokens;
