@@ -74,7 +74,7 @@ const PANEL: usize = WIDTH * size_of::<u32>();
 /// As [`Tile::multiply`], for 32 rows.
 #[inline(always)]
 unsafe fn four<U: Unit, const INT8: bool>(unit: &mut U, operands: Operands, sums: *mut u32) {
-    let Operands { left, stride, right, steps } = operands;
+    let Operands { left, stride, right, steps, .. } = operands;
     // SAFETY: the caller's promise; the second tiles are 16 rows or channels on.
     unsafe {
         let below = sums.add(SIDE * WIDTH);
@@ -106,7 +106,7 @@ unsafe fn four<U: Unit, const INT8: bool>(unit: &mut U, operands: Operands, sums
 /// As [`Tile::multiply`], for 16 rows.
 #[inline(always)]
 unsafe fn two<U: Unit, const INT8: bool>(unit: &mut U, operands: Operands, sums: *mut u32) {
-    let Operands { left, stride, right, steps } = operands;
+    let Operands { left, stride, right, steps, .. } = operands;
     // SAFETY: the caller's promise; the second tile is 16 channels on.
     unsafe {
         unit.load::<0>(sums, PANEL);

@@ -4,7 +4,7 @@ use super::super::math::sigmoid;
 use super::isa::Kernel;
 use super::lhs::Left;
 use super::panel::{HALF, Panels, STEP_BLOCK, WIDTH};
-use super::tile::{Operands, Tile};
+use super::tile::{AHEAD, Operands, Tile};
 use rayon::prelude::*;
 use std::ops::Range;
 
@@ -42,40 +42,58 @@ impl Finish<'_> {
         if self.gated { HALF } else { WIDTH }
     }
 
-    /// One row of a panel, from channel `first` on.
+    /// What concerns one panel.
     #[inline(always)]
-    fn row<const LANES: usize>(&self, sums: &[u32], scale: f32, first: usize, out: &mut [f32]) {
-        if !self.gated {
-            return self.plain(sums, scale, first, out);
-        }
-        let mut both = [0f32; WIDTH];
-        self.plain(sums, scale, first, &mut both);
-        let (gates, values) = both.split_at(HALF);
-        for ((o, &gate), value) in out.iter_mut().zip(gates).zip(values) {
-            *o = gate * sigmoid::<LANES>(gate) * value;
+    fn panel(&self, panel: usize) -> PanelFinish {
+        let first = panel * WIDTH;
+        let bias = self.bias.map_or([0.0; WIDTH], |bias| part(bias, first));
+        match self.channels {
+            None => PanelFinish { start: bias.map(f32::to_bits), scales: None },
+            Some(Channels { scales, offsets }) => {
+                let start = part(offsets, first).map(|offset| offset.wrapping_neg() as u32);
+                PanelFinish { start, scales: Some((part(scales, first), bias)) }
+            }
         }
     }
+}
 
+/// The values of a panel's channels; zeros for those that do not exist.
+#[inline(always)]
+fn part<T: Copy + Default>(values: &[T], first: usize) -> [T; WIDTH] {
+    let values = &values[first.min(values.len())..];
+    match values.first_chunk() {
+        Some(whole) => *whole,
+        None => std::array::from_fn(|i| values.get(i).copied().unwrap_or_default()),
+    }
+}
+
+/// [`Finish`] of one panel.
+struct PanelFinish {
+    /// What every row's sums start from.
+    start: [u32; WIDTH],
+    /// Of integer sums, with the bias.
+    scales: Option<([f32; WIDTH], [f32; WIDTH])>,
+}
+
+impl PanelFinish {
+    /// Turns a row's sums into its outputs, as bits; `scale` is that of the row.
     #[inline(always)]
-    fn plain(&self, sums: &[u32], scale: f32, first: usize, out: &mut [f32]) {
-        match self.channels {
-            None => {
-                for (o, sum) in out.iter_mut().zip(sums) {
-                    *o = f32::from_bits(*sum);
-                }
-            }
-            Some(Channels { scales, offsets }) => {
-                let channels = scales[first..].iter().zip(&offsets[first..]);
-                for ((o, sum), (by, offset)) in out.iter_mut().zip(sums).zip(channels) {
-                    *o = (*sum as i32 - offset) as f32 * (scale * by);
-                }
+    fn row(&self, sums: &mut [u32; WIDTH], scale: f32) {
+        if let Some((scales, bias)) = &self.scales {
+            for (sum, (by, bias)) in sums.iter_mut().zip(scales.iter().zip(bias)) {
+                *sum = (*sum as i32 as f32 * (scale * by) + bias).to_bits();
             }
         }
-        if let Some(bias) = self.bias {
-            for (o, bias) in out.iter_mut().zip(&bias[first..]) {
-                *o += bias;
-            }
-        }
+    }
+}
+
+/// `silu(gate) * value` of a row whose first half are gates, in its first half.
+#[inline(always)]
+fn gate<const LANES: usize>(row: &mut [u32; WIDTH]) {
+    let (gates, values) = row.split_at_mut(HALF);
+    for (gate, value) in gates.iter_mut().zip(values) {
+        let z = f32::from_bits(*gate);
+        *gate = (z * sigmoid::<LANES>(z) * f32::from_bits(*value)).to_bits();
     }
 }
 
@@ -101,18 +119,6 @@ pub(super) struct Target {
 unsafe impl Send for Target {}
 // SAFETY: as above.
 unsafe impl Sync for Target {}
-
-impl Target {
-    /// # Safety
-    /// The elements must lie in the buffer and nothing else may use them meanwhile.
-    #[inline(always)]
-    unsafe fn row<'a>(self, row: usize, columns: Range<usize>) -> &'a mut [f32] {
-        // SAFETY: the caller's promise.
-        unsafe {
-            std::slice::from_raw_parts_mut(self.data.add(row * self.columns + columns.start), columns.len())
-        }
-    }
-}
 
 impl Job<'_> {
     /// Writes every element of `out`, `[n, m]`.
@@ -159,22 +165,30 @@ pub(super) unsafe fn run<T: Tile>(job: &Job<'_>, target: Target, rows: Range<usi
         for (i, panel) in panels.clone().enumerate() {
             let right = (panel * weight.steps + steps.start) * WIDTH;
             let right = &weight.words()[right..right + steps.len() * WIDTH];
+            let by = job.finish.panel(panel);
             for t in 0..tiles {
                 let (first, count) = (bound(t), bound(t + 1) - bound(t));
-                let sums = if blocks == 1 {
-                    let sums = &mut single[..count * WIDTH];
-                    sums.fill(0);
-                    sums
-                } else {
-                    &mut kept[(i * rows.len() + first) * WIDTH..][..count * WIDTH]
+                let sums = match blocks {
+                    1 => &mut single[..count * WIDTH],
+                    _ => &mut kept[(i * rows.len() + first) * WIDTH..][..count * WIDTH],
                 };
+                if block == 0 {
+                    for sums in sums.as_chunks_mut::<WIDTH>().0 {
+                        *sums = by.start;
+                    }
+                }
                 let row = rows.start + first;
-                let operands = operands::<T>(left, row..row + count, right, &steps);
+                let mut operands = operands::<T>(left, row..row + count, right, &steps);
+                // Each tile asks for its share of what comes after this panel's block.
+                operands.next = right
+                    .as_ptr_range()
+                    .end
+                    .wrapping_add((weight.steps - steps.len()) * WIDTH + t * AHEAD * steps.len());
                 // SAFETY: the caller's promise for the CPU; the operands and the sums are long enough.
                 unsafe { T::multiply(&mut state, count, operands, sums.as_mut_ptr()) };
                 if block + 1 == blocks {
                     // SAFETY: the caller's promise.
-                    unsafe { finish::<T>(job, target, row, panel, sums) };
+                    unsafe { finish::<T>(job, &by, target, row, panel, sums) };
                 }
             }
         }
@@ -188,7 +202,13 @@ fn operands<T: Tile>(left: &Left, rows: Range<usize>, right: &[u32], steps: &Ran
     assert!(rows.end <= left.n && steps.end * T::WORDS <= left.stride);
     let words = &left.words()[rows.start * left.stride + steps.start * T::WORDS..];
     assert!(rows.len() * left.stride <= words.len() + steps.start * T::WORDS);
-    Operands { left: words.as_ptr(), stride: left.stride, right: right.as_ptr(), steps: steps.len() }
+    Operands {
+        left: words.as_ptr(),
+        stride: left.stride,
+        right: right.as_ptr(),
+        next: right.as_ptr(),
+        steps: steps.len(),
+    }
 }
 
 /// Writes the rows of a panel from the sums.
@@ -196,17 +216,33 @@ fn operands<T: Tile>(left: &Left, rows: Range<usize>, right: &[u32], steps: &Ran
 /// # Safety
 /// As for [`run`], for these rows and this panel.
 #[inline(always)]
-unsafe fn finish<T: Tile>(job: &Job<'_>, target: Target, row: usize, panel: usize, sums: &[u32]) {
+unsafe fn finish<T: Tile>(
+    job: &Job<'_>,
+    by: &PanelFinish,
+    target: Target,
+    row: usize,
+    panel: usize,
+    sums: &mut [u32],
+) {
     let width = job.finish.width();
     let columns = panel * width..job.m.min((panel + 1) * width);
-    for (r, sums) in sums.chunks_exact(WIDTH).enumerate() {
-        // SAFETY: the caller's promise; the last column is below `m`.
-        let out = unsafe { target.row(row + r, columns.clone()) };
-        let scale = job.left.scales[row + r];
-        match T::LANES {
-            16 => job.finish.row::<16>(sums, scale, panel * WIDTH, out),
-            8 => job.finish.row::<8>(sums, scale, panel * WIDTH, out),
-            _ => job.finish.row::<4>(sums, scale, panel * WIDTH, out),
+    let count = columns.len();
+    for (r, sums) in sums.as_chunks_mut::<WIDTH>().0.iter_mut().enumerate() {
+        by.row(sums, job.left.scales[row + r]);
+        if job.finish.gated {
+            match T::LANES {
+                16 => gate::<16>(sums),
+                8 => gate::<8>(sums),
+                _ => gate::<4>(sums),
+            }
+        }
+        // SAFETY: the caller's promise; the last column is below `m`; the bits are those of f32.
+        unsafe {
+            let to = target.data.add((row + r) * target.columns + columns.start).cast::<u32>();
+            match count {
+                WIDTH => to.copy_from_nonoverlapping(sums.as_ptr(), WIDTH),
+                _ => to.copy_from_nonoverlapping(sums.as_ptr(), count),
+            }
         }
     }
 }

@@ -1,6 +1,6 @@
 //! The register tile: some rows of activations by one panel of the weight.
 
-use super::panel::WIDTH;
+use super::panel::{STEP_BLOCK, WIDTH};
 
 /// How one step is added to the sums, by an instruction set and format.
 ///
@@ -35,6 +35,8 @@ pub(super) struct Operands {
     pub(super) stride: usize,
     /// First step of the panel.
     pub(super) right: *const u32,
+    /// What will be read by a later tile, to be fetched ahead: [`AHEAD`] words for each step. It may lie outside of any buffer.
+    pub(super) next: *const u32,
     pub(super) steps: usize,
 }
 
@@ -107,25 +109,72 @@ unsafe fn by_strips<D: Dot, const ROWS: usize>(operands: Operands, sums: *mut u3
     }
 }
 
+/// Steps of one pass of the inner loop.
+const UNROLL: usize = 4;
+const _: () = assert!(STEP_BLOCK.is_multiple_of(UNROLL));
+/// Words fetched ahead for each step: one cache line for each pass of the inner loop, so that eight tiles fetch all of a panel.
+pub(super) const AHEAD: usize = 16 / UNROLL;
+/// Rows that are reached from one pointer: what the addresses of one instruction can do, with the stride once or twice.
+const SHARING: usize = 3;
+/// Pointers for the most rows of any tile.
+const POINTERS: usize = 4;
+
+/// Brings a cache line into the second-level cache. Any address will do.
+#[inline(always)]
+fn fetch(at: *const u32) {
+    #[cfg(target_arch = "x86_64")]
+    {
+        use std::arch::x86_64::{_MM_HINT_T1, _mm_prefetch};
+        // SAFETY: a hint, which reads nothing that the program sees.
+        unsafe { _mm_prefetch::<_MM_HINT_T1>(at.cast()) };
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = at;
+}
+
+/// The same pointer, of which the compiler knows nothing: else it works out each row's address from the first one's, at every step.
+#[inline(always)]
+fn opaque(pointer: *const u32) -> *const u32 {
+    #[cfg(target_arch = "x86_64")]
+    {
+        let mut pointer = pointer;
+        // SAFETY: no instruction at all.
+        unsafe { std::arch::asm!("/* {} */", inout(reg) pointer, options(nomem, nostack, preserves_flags)) };
+        pointer
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    pointer
+}
+
 /// # Safety
 /// As [`Tile::multiply`], for `ROWS` rows and `COLUMNS` registers of channels.
 #[inline(always)]
 unsafe fn by_registers<D: Dot, const ROWS: usize, const COLUMNS: usize>(operands: Operands, sums: *mut u32) {
-    let Operands { left, stride, right, steps } = operands;
-    // SAFETY: the caller's promise.
+    let Operands { left, stride, mut right, mut next, steps } = operands;
+    let mut left: [*const u32; POINTERS] =
+        std::array::from_fn(|p| left.wrapping_add((p * SHARING).min(ROWS - 1) * stride));
+    // SAFETY: the caller's promise; steps come in multiples of `UNROLL`.
     unsafe {
         let mut acc: [[D::Sum; COLUMNS]; ROWS] = std::array::from_fn(|r| {
             std::array::from_fn(|c| D::load(sums.add(r * WIDTH + c * <D as Dot>::LANES)))
         });
-        for step in 0..steps {
-            let right = right.add(step * WIDTH);
-            let right: [D::Right; COLUMNS] =
-                std::array::from_fn(|c| D::right(right.add(c * <D as Dot>::LANES)));
-            for (r, acc) in acc.iter_mut().enumerate() {
-                let left = D::left(left.add(r * stride + step * <D as Dot>::WORDS));
-                for c in 0..COLUMNS {
-                    acc[c] = D::add(acc[c], left, right[c]);
+        for _ in 0..steps / UNROLL {
+            for step in 0..UNROLL {
+                let right: [D::Right; COLUMNS] =
+                    std::array::from_fn(|c| D::right(right.add(step * WIDTH + c * <D as Dot>::LANES)));
+                for (r, acc) in acc.iter_mut().enumerate() {
+                    let row = left[r / SHARING].add(r % SHARING * stride);
+                    let left = D::left(row.add(step * <D as Dot>::WORDS));
+                    for c in 0..COLUMNS {
+                        acc[c] = D::add(acc[c], left, right[c]);
+                    }
                 }
+            }
+            right = right.wrapping_add(UNROLL * WIDTH);
+            fetch(next);
+            next = next.wrapping_add(UNROLL * AHEAD);
+            for left in &mut left {
+                *left = opaque(left.wrapping_add(UNROLL * <D as Dot>::WORDS));
             }
         }
         for (r, acc) in acc.iter().enumerate() {
