@@ -139,7 +139,10 @@ fn opaque(pointer: *const u32) -> *const u32 {
     {
         let mut pointer = pointer;
         // SAFETY: no instruction at all.
-        unsafe { std::arch::asm!("/* {} */", inout(reg) pointer, options(nomem, nostack, preserves_flags)) };
+        #[allow(clippy::pointers_in_nomem_asm_block)]
+        unsafe {
+            std::arch::asm!("/* {} */", inout(reg) pointer, options(nomem, nostack, preserves_flags))
+        };
         pointer
     }
     #[cfg(not(target_arch = "x86_64"))]
