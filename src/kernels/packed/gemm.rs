@@ -6,6 +6,7 @@ use super::lhs::Left;
 use super::panel::{HALF, Panels, STEP_BLOCK, WIDTH};
 use super::tile::{AHEAD, Operands, Tile};
 use rayon::prelude::*;
+use std::mem::MaybeUninit;
 use std::ops::Range;
 
 /// Steps of a panel multiplied at once: what of it stays in the second-level cache beside the rows of a task.
@@ -122,13 +123,13 @@ unsafe impl Sync for Target {}
 
 impl Job<'_> {
     /// Writes every element of `out`, `[n, m]`.
-    pub(super) fn run(&self, out: &mut [f32]) {
+    pub(super) fn run(&self, out: &mut [MaybeUninit<f32>]) {
         let (n, m) = (self.left.n, self.m);
         assert_eq!(out.len(), n * m);
         if out.is_empty() {
             return;
         }
-        let target = Target { data: out.as_mut_ptr(), columns: m };
+        let target = Target { data: out.as_mut_ptr().cast(), columns: m };
         let count = m.div_ceil(self.finish.width());
         assert!(count * WIDTH * self.panels.steps <= self.panels.words().len());
         let (across, down) = (count.div_ceil(PANELS), n.div_ceil(TASK_ROWS));

@@ -172,14 +172,17 @@ impl PackedWeight {
     /// `[n, m]`, of the `m` outputs that `finish` leaves.
     fn product(&self, kernel: Kernel, x: &[f32], n: usize, m: usize, finish: Finish<'_>) -> Vec<f32> {
         let k = self.panels.k;
-        let mut out = vec![0f32; n * m];
+        let mut out = Vec::with_capacity(n * m);
         let rows = lhs::rows_at_once(kernel, k);
-        for (i, out) in out.chunks_mut((rows * m).max(1)).enumerate() {
+        let room = &mut out.spare_capacity_mut()[..n * m];
+        for (i, out) in room.chunks_mut((rows * m).max(1)).enumerate() {
             let n = out.len() / m;
             let left = Left::new(kernel, &x[i * rows * k..(i * rows + n) * k], n, k);
             Job { kernel, left: &left, panels: &self.panels, m, finish }.run(out);
             left.recycle();
         }
+        // SAFETY: the chunks are all of `room`, and a job writes every element of its own.
+        unsafe { out.set_len(n * m) };
         out
     }
 

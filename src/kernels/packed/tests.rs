@@ -6,6 +6,7 @@ use super::isa::kernels;
 use super::words::{bf16, halves};
 use super::*;
 use candle_core::Device;
+use std::mem::MaybeUninit;
 
 pub(super) fn every_kernel(format: WeightFormat) -> Vec<Kernel> {
     let levels = Level::available().into_iter().map(|level| kernels(level, format));
@@ -106,10 +107,12 @@ fn every_element_is_written() {
         let packed = PackedWeight::bf16_from_f32(&w, m, k).unwrap();
         for kernel in every_kernel(WeightFormat::Bf16) {
             let left = Left::new(kernel, &x, n, k);
-            let mut out = vec![f32::NAN; n * m];
+            let mut out = vec![MaybeUninit::new(f32::NAN); n * m];
             let finish = packed.finish(None);
             Job { kernel, left: &left, panels: &packed.panels, m, finish }.run(&mut out);
-            assert!(out.iter().all(|v| v.is_finite()), "{} {n}x{k}x{m}", kernel.name);
+            // SAFETY: every element was initialised above.
+            let written = out.iter().all(|v| unsafe { v.assume_init() }.is_finite());
+            assert!(written, "{} {n}x{k}x{m}", kernel.name);
         }
     }
 }
