@@ -3,6 +3,9 @@
 //! `cargo run --release --example ask -- --model DIR --image P --prompt TEXT`. With the feature `hub`, `--model` may also
 //! be a repository such as `Qwen/Qwen2.5-VL-3B-Instruct`.
 
+#[path = "common/stdout.rs"]
+mod stdout;
+
 use clap::Parser;
 use sdim::kernels::WeightFormat;
 use sdim::read_rgb;
@@ -73,11 +76,9 @@ fn run(args: &Args) -> sdim::Result<String> {
 }
 
 fn main() -> ExitCode {
-    match run(&Args::parse()) {
-        Ok(line) => {
-            println!("{line}");
-            ExitCode::SUCCESS
-        }
+    let answer = run(&Args::parse()).map_err(|e| e.to_string());
+    match answer.and_then(|line| stdout::print(&line).map_err(|e| format!("stdout: {e}"))) {
+        Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("Error: {error}");
             ExitCode::FAILURE

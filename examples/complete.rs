@@ -7,7 +7,7 @@ mod common;
 
 use anyhow::Context;
 use clap::Parser;
-use common::{load_as, rounded};
+use common::{load_as, rounded, stdout};
 use indicatif::{ProgressBar, ProgressStyle};
 use sdim::depth::metrics::{Errors, errors};
 use sdim::depth::{interpolate, preview};
@@ -169,10 +169,10 @@ fn main() -> anyhow::Result<()> {
             }
             object["nearest"] = error_json(nearest);
         }
-        println!("{object}");
+        stdout::print(&object.to_string())?;
         return Ok(());
     }
-    println!(
+    let mut lines = vec![format!(
         "{}x{}: {} measured, {} asked, {} of {} pixels valid, in {:.2} s (load {:.2} s, {:.0} queries/s)",
         map.width(),
         map.height(),
@@ -183,16 +183,18 @@ fn main() -> anyhow::Result<()> {
         s.total,
         load_seconds,
         per_second
-    );
+    )];
     if let Some((model, nearest)) = &scores {
-        println!("error   MAE {} m (nearest neighbour {} m)", rounded(model.mae), rounded(nearest.mae));
+        let [model, nearest] = [model.mae, nearest.mae].map(rounded);
+        lines.push(format!("error   MAE {model} m (nearest neighbour {nearest} m)"));
     }
     if saturation.pixels > 0 {
-        println!(
+        lines.push(format!(
             "note    {} pixels are beyond the range of dense.png; dense.npy has them",
             saturation.pixels
-        );
+        ));
     }
-    println!("wrote   {}", args.out.display());
+    lines.push(format!("wrote   {}", args.out.display()));
+    stdout::print(&lines.join("\n"))?;
     Ok(())
 }

@@ -1,9 +1,28 @@
-//! Writing files so that a failure leaves nothing half-written behind.
+//! Whole files: read within a limit, and written so that a failure leaves nothing half-written behind.
 
 use std::fs;
+use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use crate::error::{Error, Result};
+
+/// Bytes of a configuration or vocabulary, at most. Published vocabularies have 7 to 20 MB.
+pub(crate) const TEXT_LIMIT: u64 = 64 << 20;
+
+/// Reads a file that holds text. One beyond [`TEXT_LIMIT`], or without an end, is refused before it fills the memory.
+pub(crate) fn read_text(path: &Path) -> Result<Vec<u8>> {
+    read_within(path, TEXT_LIMIT)
+}
+
+fn read_within(path: &Path, limit: u64) -> Result<Vec<u8>> {
+    let file = fs::File::open(path).map_err(Error::io(path))?;
+    let mut bytes = Vec::new();
+    file.take(limit + 1).read_to_end(&mut bytes).map_err(Error::io(path))?;
+    if bytes.len() as u64 > limit {
+        return Err(Error::format(path, "more bytes", format!("at most {limit} bytes")));
+    }
+    Ok(bytes)
+}
 
 /// Writes the bytes beside the target and renames them into place: on any error the target is as it was before.
 pub(crate) fn write_whole(path: &Path, bytes: &[u8]) -> Result<()> {
@@ -38,6 +57,20 @@ mod tests {
         write_whole(&path, b"second").unwrap();
         assert_eq!(fs::read(&path).unwrap(), b"second");
         assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn a_file_is_read_up_to_the_limit_and_not_beyond() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.json");
+        write_whole(&path, b"12345").unwrap();
+        assert_eq!(read_within(&path, 5).unwrap(), b"12345");
+        let error = read_within(&path, 4).unwrap_err().to_string();
+        assert!(error.contains("a.json") && error.contains("at most 4 bytes"), "{error}");
+        assert!(matches!(read_text(&dir.path().join("none")), Err(Error::Io { .. })));
+        if Path::new("/dev/zero").exists() {
+            assert!(matches!(read_text(Path::new("/dev/zero")), Err(Error::Format { .. })));
+        }
     }
 
     #[test]

@@ -21,7 +21,7 @@ use crate::adapter::{SETTINGS, TENSORS};
 use crate::error::{Error, Result};
 use crate::model::SdimModel;
 use crate::vlm::ChatModel;
-use crate::vlm::checkpoint::{CONFIG, PREPROCESSOR, TOKENIZER};
+use crate::vlm::checkpoint::{CONFIG, PREPROCESSOR, PROCESSOR, TOKENIZER};
 use crate::vlm::generate::GENERATION;
 use crate::vlm::shards::{INDEX, SINGLE, shard_names};
 use candle_core::Device;
@@ -86,9 +86,9 @@ pub fn is_repository(name: &str) -> bool {
 }
 
 impl Hub {
-    /// The local folder of a checkpoint, complete: `config.json`, `preprocessor_config.json`, `tokenizer.json`, and
-    /// `model.safetensors` or its shards with their index; `generation_config.json`, `sdim.json` and `sdim.safetensors`
-    /// where the repository has them. `revision` is a branch, a tag or a commit, `main` if none is given.
+    /// The local folder of a checkpoint, complete: `config.json`, `preprocessor_config.json` or `processor_config.json`,
+    /// `tokenizer.json`, and `model.safetensors` or its shards with their index; `generation_config.json`, `sdim.json` and
+    /// `sdim.safetensors` where the repository has them. `revision` is a branch, a tag or a commit, `main` if none is given.
     ///
     /// # Errors
     /// [`Error::Hub`] lists the files that are not in the cache, and says why they were not fetched; [`Error::Argument`] on
@@ -112,7 +112,8 @@ impl Hub {
                 missing if missing.is_empty() => return Ok(dir),
                 missing => missing,
             },
-            None => request.files.missing_in(Path::new(""))?,
+            // No file of a checkpoint stands there.
+            None => request.files.missing_in(&self.folder(request))?,
         };
         if self.offline {
             return Err(self.error(request, missing, "offline, so it was not fetched"));
@@ -200,6 +201,11 @@ enum Files {
     Adapter,
 }
 
+/// The file that may stand in a required one's place.
+fn newer(name: &str) -> Option<&'static str> {
+    (name == PREPROCESSOR).then_some(PROCESSOR)
+}
+
 impl Files {
     fn required(self) -> &'static [&'static str] {
         match self {
@@ -210,14 +216,15 @@ impl Files {
 
     fn optional(self) -> &'static [&'static str] {
         match self {
-            Files::Checkpoint => &[GENERATION, SETTINGS, TENSORS],
+            Files::Checkpoint => &[PROCESSOR, GENERATION, SETTINGS, TENSORS],
             Files::Adapter => &[],
         }
     }
 
     /// The files that must be there and are not; a link whose target is gone counts as missing.
     fn missing_in(self, dir: &Path) -> Result<Vec<String>> {
-        let absent = |name: &&str| !dir.join(name).exists();
+        let absent =
+            |name: &&str| !dir.join(name).exists() && !newer(name).is_some_and(|n| dir.join(n).exists());
         let mut missing: Vec<String> =
             self.required().iter().copied().filter(absent).map(String::from).collect();
         if self == Files::Checkpoint && absent(&SINGLE) {

@@ -153,6 +153,16 @@ fn saving_and_loading_keeps_every_bit() {
     }
 }
 
+/// A product of factors that are not there would have 2^48 values.
+#[test]
+fn the_layout_of_a_large_model_costs_no_memory() {
+    let mut config = Base::new().files.parse().unwrap().config;
+    (config.text.hidden_size, config.text.layers) = (1 << 24, 1);
+    let layout = Adapter::layout(&config, &adapted()).unwrap();
+    assert_eq!(layout["model.layers.0.self_attn.q_proj.lora_A.weight"], [3, 1 << 24]);
+    assert_eq!(layout["model.layers.0.self_attn.q_proj.lora_B.weight"], [1 << 24, 3]);
+}
+
 #[test]
 fn what_an_adapter_has_wrong_is_named() {
     let base = Base::new();

@@ -9,7 +9,7 @@ use sdim::vlm::chat::{ChatPrompt, Part};
 use sdim::vlm::{AnswerOptions, ChatModel};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::process::{Command, Output, Stdio};
 use tempfile::TempDir;
 
 const QUESTION: &str = "How far?";
@@ -82,11 +82,17 @@ impl Checkpoint {
     }
 
     fn ask(&self, args: &[&str]) -> Output {
+        self.command(args).output().unwrap()
+    }
+
+    fn command(&self, args: &[&str]) -> Command {
         let image = fixture().join(format!("image_{CASE}.png"));
         let base = ["--model", text(self.dir.path()), "--image", text(&image), "--prompt", QUESTION];
         // A later flag of the same name replaces an earlier one only if it is told apart; so each is given once.
         let base = base.chunks(2).filter(|pair| !args.contains(&pair[0])).flatten().copied();
-        Command::new(common::program("ask")).args(base).args(args).output().unwrap()
+        let mut command = Command::new(common::program("ask"));
+        command.args(base).args(args);
+        command
     }
 
     /// The example must end with code 1 and one message that names `wanted`, and print nothing else.
@@ -212,7 +218,7 @@ fn without_json_the_words_alone_are_printed() {
 }
 
 #[test]
-fn an_answer_ends_before_a_stop_id_and_has_no_token_that_the_vocabulary_lacks() {
+fn an_answer_ends_before_a_stop_id() {
     let checkpoint = Checkpoint::new();
     let model = checkpoint.load().unwrap();
     let image = sdim::read_rgb(fixture().join(format!("image_{CASE}.png"))).unwrap();
@@ -221,13 +227,60 @@ fn an_answer_ends_before_a_stop_id_and_has_no_token_that_the_vocabulary_lacks() 
     let options = AnswerOptions { stop_ids: Some(vec![golden[3]]), ..Default::default() };
     let answer = model.answer(&image, QUESTION, &options).unwrap();
     assert_eq!(answer.generated_ids, golden[..3]);
-    // A vocabulary that ends before the id that would come first.
-    let mut short = tokenizer(None);
-    short["added_tokens"].as_array_mut().unwrap().retain(|t| t["id"].as_u64() != Some(301));
-    let vocab = short["model"]["vocab"].as_object_mut().unwrap();
-    vocab.retain(|_, id| id.as_u64() != Some(301));
-    checkpoint.write("tokenizer.json", &short);
-    assert_eq!(checkpoint.load().unwrap().tokenizer.vocab_size(), 301);
+}
+
+/// The output head has more columns than the vocabulary has tokens: here one of them is ten times as likely as any token.
+#[test]
+fn columns_without_a_token_are_never_chosen() {
+    let checkpoint = Checkpoint::new();
+    let path = checkpoint.path("model.safetensors");
+    let mut tensors = candle_core::safetensors::load(&path, &Device::Cpu).unwrap();
+    let name = ["lm_head.weight", "model.embed_tokens.weight"].into_iter().find(|n| tensors.contains_key(*n));
+    let head = tensors[name.unwrap()].to_dtype(candle_core::DType::F32).unwrap();
+    let wanted = golden().integers(&format!("{CASE}.generated_ids_rp105"));
+    let logits: Vec<f32> = golden().take(&format!("{CASE}.last_logits")).unwrap().to_vec1().unwrap();
+    assert!(logits[wanted[0] as usize] > 0.0 && logits.len() == 304);
+    let loud = (head.narrow(0, wanted[0] as usize, 1).unwrap() * 10.0).unwrap();
+    let head = candle_core::Tensor::cat(&[head.narrow(0, 0, 303).unwrap(), loud], 0).unwrap();
+    tensors.insert(name.unwrap().into(), head);
+    candle_core::safetensors::save(&tensors, &path).unwrap();
+    let out = checkpoint.ask(&["--json", "--max-new-tokens", &wanted.len().to_string()]);
+    let v: Value = serde_json::from_slice(&out.stdout).unwrap();
+    assert_eq!(ids(&v["generated_ids"]), wanted);
+    first_logits_are_those_of(&v["first_logits_top"], &logits);
+}
+
+/// `transformers` 5 writes the keys of `preprocessor_config.json` into `processor_config.json`.
+#[test]
+fn a_checkpoint_as_newer_versions_save_it_answers_alike() {
+    let checkpoint = Checkpoint::new();
+    let answer = || checkpoint.ask(&["--json", "--max-new-tokens", "1"]).stdout;
+    let as_published = answer();
+    let older = checkpoint.path("preprocessor_config.json");
+    let mut part: Value = serde_json::from_slice(&std::fs::read(&older).unwrap()).unwrap();
+    std::fs::remove_file(&older).unwrap();
+    let write = |json: Value| checkpoint.write("processor_config.json", &json);
+    write(json!({"processor_class": "Qwen2_5_VLProcessor"}));
+    checkpoint.does_not_load("preprocessor_config.json");
+    write(json!({"processor_class": "Qwen2_5_VLProcessor", "image_processor": part}));
+    assert!(!as_published.is_empty());
+    assert_eq!(answer(), as_published);
+    // Where both stand, the reference takes the newer one.
+    checkpoint.write("preprocessor_config.json", &json!({"patch_size": 7}));
+    checkpoint.load().unwrap();
+    part["image_std"] = json!([1, 1, 0]);
+    write(json!({"image_processor": part}));
+    checkpoint.does_not_load("image_processor.image_std");
+}
+
+#[test]
+fn nobody_reading_the_answer_is_no_failure() {
+    let checkpoint = Checkpoint::new();
+    let mut command = checkpoint.command(&["--max-new-tokens", "1"]);
+    let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    drop(child.stdout.take());
+    let out = child.wait_with_output().unwrap();
+    assert!(out.status.success() && out.stderr.is_empty(), "{}", String::from_utf8_lossy(&out.stderr));
 }
 
 #[test]

@@ -5,7 +5,7 @@ mod common;
 use common::program;
 use serde_json::Value;
 use std::path::Path;
-use std::process::{Command, Output};
+use std::process::{Command, Output, Stdio};
 
 fn run(name: &str, args: &[&str]) -> Output {
     Command::new(program(name)).args(args).output().unwrap()
@@ -36,6 +36,21 @@ fn complete_runs_on_the_bundled_pair() {
     let bundled = Path::new(env!("CARGO_MANIFEST_DIR")).join("assets/example/sparse.png");
     let sparse = sdim::SparseDepth::read(bundled, Some(sdim::DepthScale::millimetres())).unwrap();
     assert!(sparse.points().all(|(x, y, d)| again.get(x, y) == Some(d)), "measured pixels in the file");
+}
+
+#[test]
+fn complete_does_its_work_when_nobody_reads_on() {
+    for json in [&["--json"][..], &[]] {
+        let dir = tempfile::tempdir().unwrap();
+        let mut command = Command::new(program("complete"));
+        command.args(["--plan", "stride:32", "--out", text(dir.path())]).args(json);
+        let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+        drop(child.stdout.take());
+        let out = child.wait_with_output().unwrap();
+        let said = String::from_utf8_lossy(&out.stderr);
+        assert!(out.status.success() && !said.contains("panicked"), "{said}");
+        assert!(dir.path().join("preview.png").exists());
+    }
 }
 
 #[test]

@@ -266,6 +266,20 @@ fn only_what_is_needed_is_fetched_and_only_once() {
     assert_eq!(server.asked(), ["config.json"], "the rest was there");
 }
 
+/// What `transformers` 5 saves has the preprocessor's keys in another file.
+#[test]
+fn a_repository_of_newer_versions_is_complete() {
+    let mut files = files();
+    let part: Value = serde_json::from_slice(&files.remove("preprocessor_config.json").unwrap()).unwrap();
+    files.insert("processor_config.json".into(), json!({"image_processor": part}).to_string().into_bytes());
+    let server = Server::new(files.clone());
+    let dir = tempfile::tempdir().unwrap();
+    let snapshot = server.hub(dir.path()).checkpoint(REPOSITORY, None).unwrap();
+    assert_eq!(server.asked(), files.keys().cloned().collect::<Vec<_>>());
+    SdimModel::load(&snapshot, &Device::Cpu).unwrap();
+    assert_eq!(offline(dir.path()).checkpoint(REPOSITORY, None).unwrap(), snapshot);
+}
+
 #[test]
 fn what_the_hub_does_not_have_is_listed() {
     let dir = tempfile::tempdir().unwrap();

@@ -12,7 +12,9 @@ use sdim::query::number::{DepthUnit, DigitReader, NumberFormat, Reading, read_bi
 use sdim::query::prompt::Tokens;
 use sdim::query::{Hint, MeasurementPrompt, PixelReference, Prefix, Query, Settings, ask};
 use sdim::supervise::init::FreshFiles;
+use sdim::vlm::cache::KvCache;
 use sdim::vlm::decoder::{Context, Keep};
+use sdim::vlm::grid::Grid;
 use sdim::vlm::rope::{Position, RopeLayout};
 
 /// Largest difference, relative to the largest value.
@@ -322,6 +324,27 @@ fn text_after_the_image_goes_on_at_its_larger_side_and_not_at_its_number_of_toke
     assert!(relative_difference(&together, &last(run(&right))) <= TOLERANCE);
     let counted = relative_difference(&together, &last(run(&by_hand(rows * cols))));
     assert!(counted > 10.0 * TOLERANCE, "token count as position: {counted:.1e}");
+}
+
+#[test]
+fn caches_and_grids_that_do_not_fit_are_refused() {
+    let setup = Setup::new(&pointer_and_bins(), true, None);
+    let (model, decoder) = (&setup.model, &setup.model.vlm.decoder);
+    let (one, none) = (decoder.embed(&[1]).unwrap(), decoder.embed(&[1]).unwrap().narrow(0, 0, 0).unwrap());
+    let at = [Position::text(0.0)];
+    let mut others = KvCache::new(1, 1);
+    for (embedded, positions, cache, named) in [
+        (&none, &at[..0], &mut decoder.cache(1), "rows"),
+        (&none, &at[..0], &mut decoder.cache(0), "rows"),
+        (&one, &at[..], &mut decoder.cache(0), "rows"),
+        (&one, &at[..], &mut others, "layers of a cache"),
+    ] {
+        let error = model.vlm.prefill(embedded, positions, cache, Keep::Last).unwrap_err();
+        assert!(matches!(&error, sdim::Error::Argument { name, .. } if *name == named), "{error}");
+    }
+    let grid = Grid { height: 0, width: 0 };
+    let error = model.prompts.prefix(&setup.sparse, grid, (0, 0), &model.vlm.config, 0).unwrap_err();
+    assert!(matches!(error, sdim::Error::Argument { name: "image tokens", .. }), "{error}");
 }
 
 #[test]

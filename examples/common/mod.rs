@@ -1,6 +1,8 @@
 //! What the examples share.
 #![allow(dead_code)]
 
+pub mod stdout;
+
 use sdim::system::device;
 use sdim::{DepthCompleter, LoadOptions};
 use std::path::Path;
@@ -25,7 +27,7 @@ pub fn load_as(model: &str, options: &LoadOptions) -> anyhow::Result<DepthComple
     })
 }
 
-/// Four significant decimals.
+/// Four decimals.
 pub fn rounded(value: f64) -> String {
     format!("{value:.4}")
 }

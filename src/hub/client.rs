@@ -1,6 +1,6 @@
 //! Fetching what the cache lacks, through the `hf-hub` crate.
 
-use super::{Download, Files, Hub, Request, is_commit};
+use super::{Download, Files, Hub, Request, is_commit, newer};
 use crate::error::{Error, Result};
 use crate::vlm::shards::{INDEX, SINGLE, shard_names};
 use hf_hub::api::Progress;
@@ -64,12 +64,17 @@ struct Fetch<'a> {
 impl Fetch<'_> {
     fn all(&self, there: &BTreeSet<&str>) -> Result<()> {
         let files = self.request.files;
-        let mut wanted: Vec<&str> = files.required().to_vec();
+        let there_or_newer = |name: &&'static str| match newer(name) {
+            Some(newer) if !there.contains(name) && there.contains(newer) => newer,
+            _ => *name,
+        };
+        let mut wanted: Vec<&str> = files.required().iter().map(there_or_newer).collect();
         if files == Files::Checkpoint {
             wanted.push(if there.contains(SINGLE) { SINGLE } else { INDEX });
         }
         self.expect(wanted.iter().copied(), there)?;
-        wanted.extend(files.optional().iter().filter(|name| there.contains(*name)));
+        let optional = files.optional().iter().filter(|name| there.contains(*name));
+        wanted.extend(optional);
         for name in &wanted {
             self.file(name)?;
         }

@@ -212,7 +212,7 @@ impl PromptWriter {
     /// The shared prefix: text, image placeholders, text, measurements; and the frame's space.
     ///
     /// # Errors
-    /// [`crate::Error::Argument`] if the template holds image placeholders of its own.
+    /// [`crate::Error::Argument`] if the template holds image placeholders of its own, or the grid no merged token.
     pub fn prefix(
         &self,
         sparse: &SparseDepth,
@@ -243,13 +243,16 @@ impl PromptWriter {
         ids.extend(&self.after_image);
         let scale = self.settings.position_scale;
         let walked = positions(&ids, &[grid], config, scale)?;
+        let Some(&image_start) = walked.image_starts.first() else {
+            return Err(Error::argument("image tokens", 0, "at least one"));
+        };
         let mut tokens = Tokens { ids, positions: walked.positions, glimpses: Vec::new() };
         let space = FrameSpace {
             width: sparse.width(),
             height: sparse.height(),
             resized,
             merged,
-            image_start: walked.image_starts[0],
+            image_start,
             position_scale: scale,
             next: walked.next,
             unit: self.unit(sparse),

@@ -5,6 +5,7 @@ use super::mode::{AnswerMode, Generation};
 use super::number::{DepthUnit, NumberFormat};
 use super::template::PromptTemplate;
 use crate::error::{Error, Result};
+use crate::files::read_text;
 use crate::fusion::FusionConfig;
 use crate::vlm::lora::{LoraConfig, LoraMode, LoraSet};
 use crate::vlm::rope::RopeLayout;
@@ -218,7 +219,7 @@ impl Settings {
     /// # Errors
     /// [`Error::Io`], and as [`Settings::from_bytes`].
     pub fn from_file(path: &std::path::Path) -> Result<Self> {
-        Self::from_bytes(path, &std::fs::read(path).map_err(Error::io(path))?)
+        Self::from_bytes(path, &read_text(path)?)
     }
 
     /// The text of `sdim.json`.

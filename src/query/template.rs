@@ -150,6 +150,7 @@ impl PromptTemplate {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::vlm::chat::{ChatPrompt, IMAGE_PLACEHOLDER, Part};
 
     #[test]
     fn the_papers_sentences_are_verbatim() {
@@ -181,6 +182,16 @@ mod tests {
         }
         assert_eq!(PromptTemplate::preset("Paper"), None);
         assert_eq!(PromptTemplate::preset("depthlm"), Some(PromptTemplate::depthlm()));
+    }
+
+    #[test]
+    fn questions_are_framed_as_conversations_are() {
+        for t in [PromptTemplate::paper_marked(), PromptTemplate::depthlm()] {
+            let (question, _) = t.query.split_once(CHAT_AFTER).unwrap();
+            let chat = ChatPrompt::new().user([Part::Image, question.into()]).text();
+            let ours = [&t.before_image, IMAGE_PLACEHOLDER, &t.after_image, &t.query].concat();
+            assert_eq!(ours, chat);
+        }
     }
 
     #[test]

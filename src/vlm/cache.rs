@@ -35,6 +35,11 @@ impl KvCache {
         self.len == 0
     }
 
+    /// Layers.
+    pub(crate) fn layers(&self) -> usize {
+        self.layers.len()
+    }
+
     /// Keys and values of a layer, each `[items * len, kv_heads * head_dim]`; `None` while empty.
     pub fn layer(&self, layer: usize) -> Option<(&Tensor, &Tensor)> {
         self.layers.get(layer)?.as_ref().map(|(k, v)| (k, v))

@@ -1,14 +1,17 @@
 //! The published files of a checkpoint that are not tensors, from a directory or from memory.
 
 use super::config::{VlmConfig, parse_json};
-use super::preprocess::PreprocessorConfig;
+use super::preprocess::{IMAGE_PROCESSOR, PreprocessorConfig};
 use super::tokenizer::Tokenizer;
 use crate::error::{Error, Result};
+use crate::files::read_text;
 use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 
 pub(crate) const CONFIG: &str = "config.json";
 pub(crate) const PREPROCESSOR: &str = "preprocessor_config.json";
+/// Where `transformers` 5 puts what stood in [`PREPROCESSOR`], under `image_processor`.
+pub(crate) const PROCESSOR: &str = "processor_config.json";
 pub(crate) const TOKENIZER: &str = "tokenizer.json";
 
 /// Where the files are.
@@ -42,7 +45,7 @@ impl<'a> Source<'a> {
     pub(crate) fn read(&self, name: &str) -> Result<Cow<'a, [u8]>> {
         let path = self.path(name);
         let Some(files) = self.memory else {
-            return std::fs::read(&path).map(Cow::Owned).map_err(Error::io(path));
+            return read_text(&path).map(Cow::Owned);
         };
         match files.iter().find(|(n, _)| *n == name) {
             Some((_, bytes)) => Ok(Cow::Borrowed(bytes)),
@@ -62,7 +65,14 @@ impl<'a> Source<'a> {
         VlmConfig::from_json(&file, &json)
     }
 
+    /// As in the reference, an `image_processor` in the newer file goes before the older file.
     pub(crate) fn preprocessor(&self) -> Result<PreprocessorConfig> {
+        if self.has(PROCESSOR) {
+            let (file, json) = self.json(PROCESSOR)?;
+            if json.get(IMAGE_PROCESSOR).is_some() {
+                return PreprocessorConfig::from_json(&file, &json);
+            }
+        }
         let (file, json) = self.json(PREPROCESSOR)?;
         PreprocessorConfig::from_json(&file, &json)
     }

@@ -4,6 +4,7 @@
 //! fields in `text_config` and 5.x moves the rotary fields into `rope_parameters`. Both are read here into one form.
 
 use crate::error::{Error, Result};
+use crate::files::read_text;
 use serde_json::Value;
 use std::path::Path;
 
@@ -117,7 +118,7 @@ impl<'a> Node<'a> {
         Self { file, prefix, value }
     }
 
-    fn path(&self, key: &str) -> String {
+    pub(crate) fn path(&self, key: &str) -> String {
         if self.prefix.is_empty() { key.to_string() } else { format!("{}.{key}", self.prefix) }
     }
 
@@ -139,7 +140,7 @@ impl<'a> Node<'a> {
         }
     }
 
-    fn size_up_to_or(&self, key: &str, most: u64, default: usize) -> Result<usize> {
+    pub(crate) fn size_up_to_or(&self, key: &str, most: u64, default: usize) -> Result<usize> {
         if self.absent(key) { Ok(default) } else { self.size_up_to(key, most) }
     }
 
@@ -184,16 +185,13 @@ impl<'a> Node<'a> {
     }
 }
 
-/// Reads a JSON file of at most 16 MiB.
+/// Reads a JSON file.
 pub(crate) fn read_json(path: &Path) -> Result<Value> {
-    parse_json(path, &std::fs::read(path).map_err(Error::io(path))?)
+    parse_json(path, &read_text(path)?)
 }
 
-/// Parses at most 16 MiB of JSON; `path` is for messages.
+/// Parses JSON; `path` is for messages.
 pub(crate) fn parse_json(path: &Path, bytes: &[u8]) -> Result<Value> {
-    if bytes.len() > 16 << 20 {
-        return Err(Error::format(path, format!("{} bytes", bytes.len()), "a JSON file under 16 MiB"));
-    }
     serde_json::from_slice(bytes).map_err(|e| Error::format(path, e.to_string(), "valid JSON"))
 }
 

@@ -175,7 +175,8 @@ impl Decoder {
     /// All layers without the final norm: `[tokens, hidden]` to the same. `trace` receives each layer's output.
     ///
     /// # Errors
-    /// [`Error::Argument`] if the rows do not divide into the cache's items; [`Error::Tensors`] on other shapes.
+    /// [`Error::Argument`] if there are no rows, they do not divide into the cache's items, or a cache is another decoder's;
+    /// [`Error::Tensors`] on other shapes.
     pub fn forward(
         &self,
         embedded: &Tensor,
@@ -238,8 +239,14 @@ impl Decoder {
 
     fn cached_layout(&self, rows: usize, shared: Option<&KvCache>, own: &KvCache) -> Result<AttentionLayout> {
         let items = own.items();
-        if !rows.is_multiple_of(items) {
-            return Err(Error::argument("rows", rows, format!("a multiple of {items} cache items")));
+        if rows == 0 || items == 0 || !rows.is_multiple_of(items) {
+            return Err(Error::argument("rows", rows, format!("a positive multiple of {items} cache items")));
+        }
+        if let Some(other) =
+            [Some(own), shared].into_iter().flatten().find(|c| c.layers() != self.layers.len())
+        {
+            let expected = format!("{}, those of the decoder", self.layers.len());
+            return Err(Error::argument("layers of a cache", other.layers(), expected));
         }
         let q_period = rows / items;
         Ok(self.layout(vec![Block {

@@ -70,7 +70,8 @@ pub struct Lora {
 }
 
 impl Lora {
-    /// Reads `{layer}.lora_A.weight` and `{layer}.lora_B.weight` if the layer is a target.
+    /// Reads `{layer}.lora_A.weight` and `{layer}.lora_B.weight` if the layer is a target. `None`, too, if one of them or the
+    /// layer's own weight is missing, which is recorded: a product of stand-ins would take time and memory for nothing.
     ///
     /// # Errors
     /// As [`Weights::get`].
@@ -78,8 +79,15 @@ impl Lora {
         let Some(config) = weights.lora().config.as_ref().filter(|c| c.covers(layer)) else {
             return Ok(None);
         };
-        let a = weights.get(&format!("{layer}.lora_A.weight"), &[config.rank, inputs])?;
-        let b = weights.get(&format!("{layer}.lora_B.weight"), &[outputs, config.rank])?;
+        let [a, b] = ["A", "B"].map(|factor| format!("{layer}.lora_{factor}.weight"));
+        let shapes = [[config.rank, inputs], [outputs, config.rank]];
+        let mut complete = weights.require(&format!("{layer}.weight"), &[outputs, inputs])?;
+        complete &= weights.require(&a, &shapes[0])?;
+        complete &= weights.require(&b, &shapes[1])?;
+        if !complete {
+            return Ok(None);
+        }
+        let (a, b) = (weights.get(&a, &shapes[0])?, weights.get(&b, &shapes[1])?);
         let scale = f64::from(config.alpha) / config.rank as f64;
         Ok(Some(Self { a, b: (b * scale)? }))
     }

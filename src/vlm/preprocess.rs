@@ -40,12 +40,18 @@ pub struct Pixels {
     pub grid: Grid,
 }
 
+/// The key that holds the image processor's part in a file that describes several.
+pub(crate) const IMAGE_PROCESSOR: &str = "image_processor";
+
+/// Side of a merged token, pixels, at most: even one token of that side has no more pixels than `max_pixels` may say.
+const MAX_SIDE: usize = 4096;
+
 /// Refuses a file that asks for other steps than resizing (bicubic), rescaling (to 0..1) and normalising.
-fn published_steps(file: &str, json: &Value) -> Result<()> {
+fn published_steps(n: &Node, json: &Value) -> Result<()> {
     let check = |key: &str, fits: fn(&Value) -> bool, expected: &str| match json.get(key) {
         None | Some(Value::Null) => Ok(()),
         Some(value) if fits(value) => Ok(()),
-        Some(value) => Err(Error::config(file, key, value.to_string(), expected)),
+        Some(value) => Err(Error::config(n.file, &n.path(key), value.to_string(), expected)),
     };
     for key in ["do_resize", "do_rescale", "do_normalize", "do_convert_rgb"] {
         check(key, |v| v == true, "true")?;
@@ -57,17 +63,23 @@ fn published_steps(file: &str, json: &Value) -> Result<()> {
 }
 
 impl PreprocessorConfig {
-    /// Reads `preprocessor_config.json`. As in the reference, `min_pixels` and `max_pixels` each go before
-    /// `size.shortest_edge` and `size.longest_edge`; a `size` that is there has no defaults for its edges.
+    /// Reads `preprocessor_config.json`, or the `image_processor` of a `processor_config.json`. As in the reference,
+    /// `min_pixels` and `max_pixels` each go before `size.shortest_edge` and `size.longest_edge`; a `size` that is there has
+    /// no defaults for its edges.
     ///
     /// # Errors
     /// [`Error::Config`] names the key that is missing, has a wrong value, or asks for other steps than the published
     /// ones.
     pub fn from_json(file: &str, json: &Value) -> Result<Self> {
-        published_steps(file, json)?;
-        let n = Node::new(file, "", json);
+        let (prefix, json) = match json.get(IMAGE_PROCESSOR) {
+            Some(part) => (IMAGE_PROCESSOR, part),
+            None => ("", json),
+        };
+        let n = Node::new(file, prefix, json);
+        published_steps(&n, json)?;
         let none = Value::Null;
-        let size = Node::new(file, "size", json.get("size").unwrap_or(&none));
+        let at = n.path("size");
+        let size = Node::new(file, &at, json.get("size").unwrap_or(&none));
         let limit = |key: &str, edge: &str, default: usize| match (n.absent(key), n.absent("size")) {
             (false, _) => n.size(key),
             (true, true) => Ok(default),
@@ -78,21 +90,26 @@ impl PreprocessorConfig {
             let parsed: Option<[f32; 3]> = serde_json::from_value(value.clone()).ok();
             parsed
                 .filter(|v| v.iter().all(|x| x.is_finite() && *x >= least))
-                .ok_or_else(|| Error::config(file, key, value.to_string(), expected))
+                .ok_or_else(|| Error::config(file, &n.path(key), value.to_string(), expected))
         };
         let (mean, deviation) = ([0.48145466, 0.4578275, 0.40821073], [0.26862954, 0.261_302_6, 0.275_777_1]);
         let config = Self {
             min_pixels: limit("min_pixels", "shortest_edge", 56 * 56)?,
             max_pixels: limit("max_pixels", "longest_edge", 28 * 28 * 1280)?,
-            patch_size: n.size_or("patch_size", 14)?,
-            temporal_patch_size: n.size_or("temporal_patch_size", 2)?,
-            merge_size: n.size_or("merge_size", 2)?,
+            patch_size: n.size_up_to_or("patch_size", 1024, 14)?,
+            temporal_patch_size: n.size_up_to_or("temporal_patch_size", 64, 2)?,
+            merge_size: n.size_up_to_or("merge_size", 64, 2)?,
             image_mean: channels("image_mean", mean, 0.0, "three numbers of 0 or more")?,
             image_std: channels("image_std", deviation, f32::MIN_POSITIVE, "three positive numbers")?,
         };
         if config.min_pixels > config.max_pixels {
             let found = config.min_pixels.to_string();
-            return Err(Error::config(file, "min_pixels", found, "at most max_pixels"));
+            return Err(Error::config(file, &n.path("min_pixels"), found, "at most max_pixels"));
+        }
+        let side = config.patch_size * config.merge_size;
+        if side > MAX_SIDE {
+            let expected = format!("at most {MAX_SIDE} pixels for patch_size x merge_size");
+            return Err(Error::config(file, &n.path("patch_size"), side.to_string(), expected));
         }
         Ok(config)
     }

@@ -1,6 +1,7 @@
 //! The checkpoint's `tokenizer.json`.
 
 use crate::error::{Error, Result};
+use crate::files::read_text;
 use std::path::Path;
 
 /// Text to token ids and back.
@@ -22,9 +23,9 @@ impl Tokenizer {
     /// Reads a `tokenizer.json`.
     ///
     /// # Errors
-    /// [`Error::Io`], and as [`Tokenizer::from_bytes`].
+    /// [`Error::Io`], and as [`Tokenizer::from_bytes`], also on more than 64 MiB.
     pub fn from_file(path: &Path) -> Result<Self> {
-        Self::from_bytes(path, &std::fs::read(path).map_err(Error::io(path))?)
+        Self::from_bytes(path, &read_text(path)?)
     }
 
     /// The id of one token by its text.

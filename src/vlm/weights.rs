@@ -164,6 +164,18 @@ impl Weights {
         self.sources.contains_key(name)
     }
 
+    /// Whether a tensor of this name and shape can be had. If not, it is recorded as missing, and no memory is set aside.
+    ///
+    /// # Errors
+    /// [`Error::Tensor`] on another shape; [`Error::TensorSet`] if the shape has more values than can be counted.
+    pub(super) fn require(&self, name: &str, shape: &[usize]) -> Result<bool> {
+        if self.made.is_some() || self.find(name, shape)?.is_some() {
+            return Ok(true);
+        }
+        self.miss(name, shape, false)?;
+        Ok(false)
+    }
+
     fn find(&self, name: &str, shape: &[usize]) -> Result<Option<&Source>> {
         let Some(source) = self.sources.get(name) else { return Ok(None) };
         if source.dims() != shape {
