@@ -22,7 +22,7 @@ fn table(text: &mut String, t: &Table) {
     let title = match t.own {
         own if own > 0 && own == t.frames => "The data set's own measurements".to_string(),
         0 => format!("{} points", t.points),
-        own => format!("{} points ({own} frames: their own measurements)", t.points),
+        own => format!("{} points ({own} of {} frames: their own measurements)", t.points, t.frames),
     };
     let _ =
         writeln!(text, "\n## {title}\n\n{} frames, {:.0} measured pixels in the mean.", t.frames, t.measured);

@@ -3,13 +3,13 @@
 use crate::depth::{SparseDepth, check_length, interpolate, is_valid, pixel_count};
 use crate::error::{Error, Result};
 
-/// Gradient error (GE), metres: the mean over pixels of `|G(p) - G(t)|`, the length of the difference of the Sobel gradients
-/// (kernels of -1..1 by 1, 2, 1, not divided by anything) of prediction and truth, `width * height` values each, row-major metres.
+/// Gradient error (GE), metres: `sqrt(mean |G(p) - G(t)|^2)`, the root mean square length of the difference of the Sobel gradients
+/// (kernels of -1, 0, 1 by 1, 2, 1, not divided by anything) of prediction and truth, `width * height` values each, row-major metres.
 ///
-/// The paper reports GE in its Table 3 without formula or source. Its figures (GE 0.348 m at MAE 0.040 m) rule out plain
-/// differences of neighbours, whose mean error is at most 4 MAE over both directions; Sobel sums of this form are what losses and
-/// edge measures of the field use (Hu et al., "Revisiting Single Image Depth Estimation", 2019). So compare GE between methods run
-/// by this crate, not with the paper's.
+/// The paper reports GE in its Table 3 without formula or source. What its figures say: in all three rows GE is 2.15 to 2.20 times the
+/// RMSE. For linear interpolation of 1000 points on eleven real indoor frames that factor is 2.3 with the formula above, 0.73 with the mean
+/// length instead, 0.45 with differences of neighbours instead of Sobel sums, 0.29 with Sobel sums divided by 8. So this is the
+/// likely reading; to be sure, compare GE between methods run by this crate.
 ///
 /// A pixel counts if all of its 3x3 neighbourhood lies in the frame and has prediction and truth, whether measured or
 /// not; `None` if there is no such pixel.
@@ -30,15 +30,15 @@ pub fn gradient_error(predicted: &[f32], truth: &[f32], width: usize, height: us
             let at = |dx: usize, dy: usize| difference[(y + dy - 1) * width + x + dx - 1];
             let gx = at(2, 0) + 2.0 * at(2, 1) + at(2, 2) - at(0, 0) - 2.0 * at(0, 1) - at(0, 2);
             let gy = at(0, 2) + 2.0 * at(1, 2) + at(2, 2) - at(0, 0) - 2.0 * at(1, 0) - at(2, 0);
-            let length = (gx * gx + gy * gy).sqrt();
+            let squared = gx * gx + gy * gy;
             // The centre has weight 0 in both kernels, so it must be looked at on its own.
-            if !(length.is_nan() || at(1, 1).is_nan()) {
-                sum += length;
+            if !(squared.is_nan() || at(1, 1).is_nan()) {
+                sum += squared;
                 count += 1;
             }
         }
     }
-    Ok((count > 0).then(|| sum / count as f64))
+    Ok((count > 0).then(|| (sum / count as f64).sqrt()))
 }
 
 /// What counts as a depth edge.
@@ -177,10 +177,10 @@ mod tests {
         let truth = vec![2.0f32; 12];
         let mut found = truth.clone();
         assert_eq!(gradient_error(&found, &truth, 4, 3).unwrap(), Some(0.0));
-        // One pixel 1 m off in the corner of a 4x3 frame: |(-1, -1)| at (1, 1), nothing at (2, 1).
+        // One pixel 1 m off in the corner of a 4x3 frame: (-1, -1) at (1, 1), nothing at (2, 1).
         found[0] = 3.0;
         let ge = gradient_error(&found, &truth, 4, 3).unwrap().unwrap();
-        assert!((ge - 2f64.sqrt() / 2.0).abs() < 1e-12);
+        assert_eq!(ge, 1.0);
         // A shift of everything has no gradient; a slope of 0.5 m per pixel has one of 8 * 0.5.
         let shifted: Vec<f32> = truth.iter().map(|t| t + 1.0).collect();
         assert_eq!(gradient_error(&shifted, &truth, 4, 3).unwrap(), Some(0.0));
