@@ -103,7 +103,11 @@ pub enum Error {
         expected: String,
     },
     /// The checkpoint's set of tensors is not the one that its config asks for.
-    #[error("checkpoint {file}: {} missing tensors {missing:?}, {} unexpected tensors {unexpected:?}", missing.len(), unexpected.len())]
+    #[error(
+        "checkpoint {file}: {} missing tensors {missing:?}, {} unexpected tensors {unexpected:?}, \
+         {} tensors of another shape {misshaped:?}",
+        missing.len(), unexpected.len(), misshaped.len()
+    )]
     TensorSet {
         /// File or directory of the checkpoint.
         file: String,
@@ -111,6 +115,8 @@ pub enum Error {
         missing: Vec<String>,
         /// Names in the checkpoint that nothing reads.
         unexpected: Vec<String>,
+        /// Names with the shape found and the one that the config needs.
+        misshaped: Vec<String>,
     },
     /// An argument or option has a value out of its range.
     #[error("{name} = {found}; expected {expected}")]

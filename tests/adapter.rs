@@ -189,8 +189,9 @@ fn what_an_adapter_has_wrong_is_named() {
         other => panic!("{other:?}"),
     }
     match fails(&|bad| bad.settings.lora.as_mut().unwrap().rank = 4) {
-        Error::Tensor { file, expected, .. } => {
-            assert!(file.ends_with("sdim.safetensors") && expected.contains('4'), "{file}, {expected}")
+        Error::TensorSet { misshaped, .. } => {
+            let factors = adapter.tensors.keys().filter(|name| name.contains(".lora_")).count();
+            assert!(misshaped.len() == factors && misshaped[0].contains("expected [4, "), "{misshaped:?}")
         }
         other => panic!("{other:?}"),
     }

@@ -184,24 +184,38 @@ fn a_tensor_of_another_shape_or_type_is_named() {
 }
 
 #[test]
-fn missing_and_unexpected_tensors_are_all_listed() {
+fn missing_unexpected_and_misshaped_tensors_are_all_listed() {
     let checkpoint = Checkpoint::new();
     let lists = || match checkpoint.error() {
-        Error::TensorSet { file, missing, unexpected } => {
+        Error::TensorSet { file, missing, unexpected, misshaped } => {
             assert!(file.ends_with("model.safetensors"), "{file}");
-            (missing, unexpected)
+            (missing, unexpected, misshaped)
         }
         other => panic!("{other:?}"),
     };
     let gone = [NORM, "sdim.fusion.rgb.bn.running_var", "visual.merger.mlp.2.bias"];
     checkpoint.write_tensors(|t| gone.iter().for_each(|name| drop(t.remove(*name).unwrap())));
-    assert_eq!(lists(), (gone.map(String::from).to_vec(), vec![]));
+    assert_eq!(lists(), (gone.map(String::from).to_vec(), vec![], vec![]));
     checkpoint.write_tensors(|t| {
         t.insert("visual.blocks.9.norm1.weight".into(), zeros(&[4]));
         t.insert("adapter.extra".into(), zeros(&[4]));
     });
     let extra = ["adapter.extra", "visual.blocks.9.norm1.weight"].map(String::from);
-    assert_eq!(lists(), (vec![], extra.to_vec()));
+    assert_eq!(lists(), (vec![], extra.to_vec(), vec![]));
+    checkpoint.write_tensors(|t| {
+        t.insert("adapter.extra".into(), zeros(&[4]));
+        t.remove("visual.merger.mlp.2.bias").unwrap();
+        // The first and the last that are read.
+        t.insert("visual.patch_embed.proj.weight".into(), zeros(&[3, 1]));
+        t.insert(NORM.into(), zeros(&[7]));
+    });
+    let (missing, unexpected, misshaped) = lists();
+    assert_eq!((&missing[..], &unexpected[..]), (&[gone[2].to_string()][..], &extra[..1]));
+    let told = misshaped.join(" ");
+    assert!(
+        misshaped.len() == 2 && told.contains("proj.weight [3, 1], expected [") && told.contains(NORM),
+        "{told}"
+    );
 }
 
 #[test]

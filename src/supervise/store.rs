@@ -75,7 +75,7 @@ pub fn load_state(dir: &Path, parameters: &mut Parameters) -> Result<usize> {
     let mut unexpected: Vec<String> = state.keys().filter(|k| *k != "step" && !known(k)).cloned().collect();
     if !unexpected.is_empty() {
         unexpected.sort();
-        return Err(Error::TensorSet { file, missing: Vec::new(), unexpected });
+        return Err(Error::TensorSet { file, missing: Vec::new(), unexpected, misshaped: Vec::new() });
     }
     let mut parts = Vec::with_capacity(parameters.all.len());
     for (name, p) in &parameters.all {

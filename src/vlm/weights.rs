@@ -34,11 +34,20 @@ impl Source {
     }
 }
 
+/// A tensor that has another shape than the config asks for.
+struct Misshaped {
+    file: String,
+    name: String,
+    found: Vec<usize>,
+    expected: Vec<usize>,
+}
+
 /// The tensors of a checkpoint under their published names.
 ///
 /// Files are mapped, not read: each tensor is converted when the model asks for it, straight into the form in which it
 /// is kept, so that no weight is ever held twice. Every read checks the shape and is recorded, so that
-/// [`Weights::finish`] can tell missing and unread tensors.
+/// [`Weights::finish`] can tell missing, misshaped and unread tensors. From the first that is missing or misshaped on, nothing
+/// is converted any more.
 pub struct Weights {
     file: String,
     device: Device,
@@ -47,7 +56,10 @@ pub struct Weights {
     lora: LoraSet,
     made: Option<Maker>,
     read: RefCell<BTreeSet<String>>,
-    missing: RefCell<BTreeMap<String, Vec<usize>>>,
+    missing: RefCell<BTreeSet<String>>,
+    misshaped: RefCell<Vec<Misshaped>>,
+    /// What stands in for tensors that are missing, misshaped, or not converted since others are.
+    stand_ins: RefCell<BTreeMap<String, Vec<usize>>>,
 }
 
 /// Maps an in-memory name of `transformers` >= 4.52, or one below the prefix that PEFT writes, to the published one.
@@ -74,6 +86,8 @@ impl Weights {
             made: None,
             read: RefCell::default(),
             missing: RefCell::default(),
+            misshaped: RefCell::default(),
+            stand_ins: RefCell::default(),
         }
     }
 
@@ -164,49 +178,56 @@ impl Weights {
         self.sources.contains_key(name)
     }
 
-    /// Whether a tensor of this name and shape can be had. If not, it is recorded as missing, and no memory is set aside.
+    /// Whether a tensor of this name and shape can be had. If not, that is recorded, and no memory is set aside.
     ///
     /// # Errors
-    /// [`Error::Tensor`] on another shape; [`Error::TensorSet`] if the shape has more values than can be counted.
+    /// [`Error::TensorSet`] if the shape has more values than can be counted.
     pub(super) fn require(&self, name: &str, shape: &[usize]) -> Result<bool> {
-        if self.made.is_some() || self.find(name, shape)?.is_some() {
+        if self.made.is_some() || self.find(name, shape).is_some() {
             return Ok(true);
         }
-        self.miss(name, shape, false)?;
+        self.stand_in(name, shape, false)?;
         Ok(false)
     }
 
-    fn find(&self, name: &str, shape: &[usize]) -> Result<Option<&Source>> {
-        let Some(source) = self.sources.get(name) else { return Ok(None) };
-        if source.dims() != shape {
+    /// Records what is wrong with a tensor; `None` if that is something, or something was wrong before.
+    fn find(&self, name: &str, shape: &[usize]) -> Option<&Source> {
+        let Some(source) = self.sources.get(name) else {
+            if self.made.is_none() {
+                self.missing.borrow_mut().insert(name.to_string());
+            }
+            return None;
+        };
+        let seen = !self.read.borrow_mut().insert(name.to_string());
+        if source.dims() != shape && !seen {
             let file = match source {
                 Source::Stored(s) => s.file(),
                 Source::Tensor(_) => &self.file,
             };
-            return Err(Error::Tensor {
+            self.misshaped.borrow_mut().push(Misshaped {
                 file: file.to_string(),
                 name: name.to_string(),
-                found: format!("shape {:?}", source.dims()),
-                expected: format!("shape {shape:?}"),
+                found: source.dims().to_vec(),
+                expected: shape.to_vec(),
             });
         }
-        self.read.borrow_mut().insert(name.to_string());
-        Ok(Some(source))
+        (self.missing.borrow().is_empty() && self.misshaped.borrow().is_empty()).then_some(source)
     }
 
     /// The tensor of this name, which must have this shape, as f32.
     ///
-    /// A missing tensor is recorded and stands in as zeros, so that [`Weights::finish`] can list all of them at once.
+    /// A missing or misshaped tensor is recorded and zeros stand in for it, so that [`Weights::finish`] can list all of them
+    /// at once.
     ///
     /// # Errors
-    /// [`Error::Tensor`] on another shape; [`Error::TensorSet`] at once if the missing tensors hold over 2^28 values.
+    /// Those of [`Weights::finish`] at once if the stand-ins hold over 2^28 values.
     pub fn get(&self, name: &str, shape: &[usize]) -> Result<Tensor> {
-        match self.find(name, shape)? {
+        match self.find(name, shape) {
             Some(Source::Tensor(t)) => Ok(t.to_dtype(DType::F32)?),
             Some(Source::Stored(s)) => s.f32(&self.device),
             None => self.make(name, shape)?.map_or_else(
                 || {
-                    self.miss(name, shape, true)?;
+                    self.stand_in(name, shape, true)?;
                     Ok(Tensor::zeros(shape, DType::F32, &Device::Cpu)?)
                 },
                 Ok,
@@ -218,9 +239,9 @@ impl Weights {
     /// on top if given.
     ///
     /// # Errors
-    /// As [`Weights::get`]; a missing matrix is recorded and takes no memory.
+    /// As [`Weights::get`]; what stands in for a matrix takes no memory.
     pub fn matrix(&self, name: &str, shape: [usize; 2], added: Option<&Tensor>) -> Result<Matrix> {
-        match self.find(name, &shape)? {
+        match self.find(name, &shape) {
             Some(Source::Tensor(t)) => Matrix::from_tensor(&t.to_dtype(DType::F32)?, added, self.format),
             Some(Source::Stored(s)) => match added {
                 Some(_) => Matrix::from_tensor(&s.f32(&self.device)?, added, self.format),
@@ -230,7 +251,7 @@ impl Weights {
                 if let Some(made) = self.make(name, &shape)? {
                     return Matrix::from_tensor(&made, added, self.format);
                 }
-                self.miss(name, &shape, false)?;
+                self.stand_in(name, &shape, false)?;
                 let zero = Tensor::zeros((1, 1), DType::F32, &Device::Cpu)?;
                 Ok(Matrix::Plain(zero.broadcast_as(&shape)?))
             }
@@ -242,22 +263,37 @@ impl Weights {
         Ok(made.transpose()?)
     }
 
-    fn miss(&self, name: &str, shape: &[usize], allocated: bool) -> Result<()> {
-        let mut missing = self.missing.borrow_mut();
-        missing.insert(name.to_string(), shape.to_vec());
+    fn stand_in(&self, name: &str, shape: &[usize], allocated: bool) -> Result<()> {
+        let mut all = self.stand_ins.borrow_mut();
+        all.insert(name.to_string(), shape.to_vec());
         let values = |s: &[usize]| s.iter().try_fold(1usize, |n, &d| n.checked_mul(d));
         let enough = if allocated {
-            let others = missing.iter().filter(|(n, s)| s.len() != 2 || *n == name);
+            let others = all.iter().filter(|(n, s)| s.len() != 2 || *n == name);
             let total = others.map(|(_, s)| values(s)).try_fold(0usize, |n, v| n.checked_add(v?));
             total.is_some_and(|n| n <= STAND_INS)
         } else {
             values(shape).is_some()
         };
-        if enough {
-            return Ok(());
+        if enough { Ok(()) } else { Err(self.wrong(Vec::new())) }
+    }
+
+    /// What was found to be wrong so far, and these tensors.
+    fn wrong(&self, unexpected: Vec<String>) -> Error {
+        let missing: Vec<String> = self.missing.borrow().iter().cloned().collect();
+        let misshaped = self.misshaped.borrow();
+        match &misshaped[..] {
+            [one] if missing.is_empty() && unexpected.is_empty() => Error::Tensor {
+                file: one.file.clone(),
+                name: one.name.clone(),
+                found: format!("shape {:?}", one.found),
+                expected: format!("shape {:?}", one.expected),
+            },
+            all => {
+                let told = |m: &Misshaped| format!("{} {:?}, expected {:?}", m.name, m.found, m.expected);
+                let misshaped = all.iter().map(told).collect();
+                Error::TensorSet { file: self.file.clone(), missing, unexpected, misshaped }
+            }
         }
-        let missing = missing.keys().cloned().collect();
-        Err(Error::TensorSet { file: self.file.clone(), missing, unexpected: Vec::new() })
     }
 
     /// Declares that a tensor may be there without being read (a redundant tied head).
@@ -267,22 +303,20 @@ impl Weights {
 
     /// Names and shapes that were asked for and are not there: of an empty set, the whole checkpoint's layout.
     pub fn wanted(&self) -> BTreeMap<String, Vec<usize>> {
-        self.missing.borrow().clone()
+        let (all, missing) = (self.stand_ins.borrow(), self.missing.borrow());
+        all.iter().filter(|(name, _)| missing.contains(*name)).map(|(n, s)| (n.clone(), s.clone())).collect()
     }
 
-    /// Must be called when the model is built: fails if a tensor was missing or one was never read.
+    /// Must be called when the model is built: fails if a tensor was missing or had another shape, or one was never read.
     ///
     /// # Errors
-    /// [`Error::TensorSet`] lists both.
+    /// [`Error::TensorSet`] lists all of them; [`Error::Tensor`] if one of another shape is all that is wrong.
     pub fn finish(&self) -> Result<()> {
         let read = self.read.borrow();
-        let missing: Vec<String> = self.missing.borrow().keys().cloned().collect();
         let mut unexpected: Vec<String> =
             self.sources.keys().filter(|k| !read.contains(*k)).cloned().collect();
         unexpected.sort();
-        if missing.is_empty() && unexpected.is_empty() {
-            return Ok(());
-        }
-        Err(Error::TensorSet { file: self.file.clone(), missing, unexpected })
+        let complete = self.missing.borrow().is_empty() && self.misshaped.borrow().is_empty();
+        if complete && unexpected.is_empty() { Ok(()) } else { Err(self.wrong(unexpected)) }
     }
 }
