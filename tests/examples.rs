@@ -111,3 +111,28 @@ fn train_resumes_and_its_checkpoint_loads() {
     );
     assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
 }
+
+#[test]
+fn throughput_times_each_stage() {
+    for weights in ["f32", "bf16", "int8"] {
+        let args = ["--random", "tiny", "--width", "64", "--height", "48", "--queries", "40"];
+        let shape =
+            ["--batch", "16", "--suffix-tokens", "3", "--digits", "2", "--weights", weights, "--json"];
+        let out = run("throughput", &[&args[..], &shape[..]].concat());
+        assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
+        let v: Value = serde_json::from_slice(&out.stdout).unwrap();
+        for key in ["vision_s", "prefill_s", "queries_s", "queries_per_second", "gflops", "peak_gflops"] {
+            assert!(v[key].as_f64().unwrap() > 0.0, "{key} of {v}");
+        }
+        assert!(v["peak_rss_bytes"].is_u64());
+        assert_eq!((v["queries"].as_u64(), v["tokens_per_query"].as_u64()), (Some(40), Some(4)));
+        // 4 x 3 merged tokens of 16 pixels between 15 and 5 of text.
+        assert_eq!(v["prompt_tokens"].as_u64(), Some(32));
+    }
+    for bad in
+        [&["--random", "9b"][..], &["--random", "tiny", "--queries", "0"], &["--model", "/nowhere"], &[]]
+    {
+        let out = run("throughput", bad);
+        assert!(!out.status.success() && out.stdout.is_empty(), "{bad:?}");
+    }
+}

@@ -30,6 +30,10 @@ fn once(format: WeightFormat) -> usize {
     #[cfg(target_arch = "x86_64")]
     {
         use std::arch::x86_64::{__m256, __m512};
+        if level.is_amx() && format != WeightFormat::F32 {
+            // SAFETY: a `Level` says AMX only where the unit was found and checked.
+            return unsafe { super::packed::amx_busy(format, STEPS / 16) };
+        }
         if level.is_avx512() {
             // SAFETY: a `Level` says AVX-512 only where the CPU reported it; the extensions are asked for here.
             return unsafe {

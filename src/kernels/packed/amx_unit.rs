@@ -77,6 +77,32 @@ impl Drop for Tiles {
     }
 }
 
+/// Multiplies tiles that stay where they are, in turn, so that no product waits for another; gives the number of operations.
+///
+/// # Safety
+/// The machine must have the unit.
+pub(in crate::kernels) unsafe fn busy(format: WeightFormat, steps: usize) -> usize {
+    // SAFETY: the caller has the unit.
+    unsafe {
+        let mut tiles = Tiles::start();
+        for _ in 0..steps {
+            if format == WeightFormat::Int8 {
+                tiles.add_int8::<0, 4, 6>();
+                tiles.add_int8::<1, 4, 7>();
+                tiles.add_int8::<2, 5, 6>();
+                tiles.add_int8::<3, 5, 7>();
+            } else {
+                tiles.add_bf16::<0, 4, 6>();
+                tiles.add_bf16::<1, 4, 7>();
+                tiles.add_bf16::<2, 5, 6>();
+                tiles.add_bf16::<3, 5, 7>();
+            }
+        }
+    }
+    let per_word = if format == WeightFormat::Int8 { 4 } else { 2 };
+    steps * 4 * 2 * 16 * 16 * 16 * per_word
+}
+
 /// Whether AMX is there, the system lets this process use it, and it computes what the plain kernels do.
 pub(in crate::kernels) fn usable() -> bool {
     static USABLE: OnceLock<bool> = OnceLock::new();

@@ -27,6 +27,8 @@ mod words;
 
 use super::exec::{dims2, expect_dims, read, tensor};
 use crate::error::{Error, Result};
+#[cfg(target_arch = "x86_64")]
+pub(super) use amx_unit::busy as amx_busy;
 use candle_core::{DType, Tensor};
 pub use gate::PackedGate;
 use gemm::{Channels, Finish, Job};
