@@ -1,11 +1,13 @@
-//! Folders of RGB-D frames: `rgb/NAME.png` or `.jpg`, `gt/NAME.png` or `.npy`, and perhaps `sparse/NAME.png` or `.npy`.
+//! Folders of RGB-D frames: `rgb/NAME.png` or `.jpg`, `gt/NAME.png` or `.npy`, and perhaps `sparse/NAME.png` or `.npy`; or the
+//! same side by side as `NAME_rgb`, `NAME_gt` and `NAME_sparse`.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 
 use image::ImageFormat;
 
-use super::files::{PICTURES, all_taken, depth, list, list_some, picture, take, unpaired};
+use super::files::{Listed, PICTURES, all_taken, depth, list, list_some, picture, take, unpaired};
+use super::flat::Flat;
 use super::{Dataset, Sample, entry};
 use crate::depth::{DepthScale, npy, png16};
 use crate::error::{Error, Result};
@@ -20,38 +22,55 @@ struct Entry {
     rgb: PathBuf,
     gt: PathBuf,
     sparse: Option<PathBuf>,
+    scale: Option<DepthScale>,
 }
 
 /// A folder of frames, in order of their names. Opening lists files, loading reads them.
 #[derive(Clone, Debug)]
 pub struct FolderDataset {
     entries: Vec<Entry>,
-    scale: Option<DepthScale>,
 }
 
 impl FolderDataset {
-    /// Lists `dir`. `scale` is the unit of its 16-bit PNGs and integer npy files; without one, loading such a file fails.
+    /// Lists `dir`. `scale` is the unit of its 16-bit PNGs and integer npy files; without one, that of `manifest.json` counts
+    /// where frames lie side by side, and else loading such a file fails.
     ///
     /// Fails with [`Error::Io`] when `rgb` or `gt` cannot be listed, and with [`Error::Format`] naming the file when a
     /// picture has no ground truth, a ground truth or measurement no picture, or there is no frame at all. Other folders
     /// (`intrinsics/`) are left alone.
     pub fn open(dir: impl AsRef<Path>, scale: impl Into<Option<DepthScale>>) -> Result<Self> {
-        let dir = dir.as_ref();
+        let (dir, scale) = (dir.as_ref(), scale.into());
+        let flat = if dir.join("rgb").exists() { None } else { Flat::list(dir, &DEPTHS)? };
+        if let Some(Flat { pictures, truths, measured, scales }) = flat {
+            let at = |name: &str, part: &str| format!("{name}_{part}.png");
+            return Self::pair(pictures, truths, measured, at, |name| scale.or(scales.get(name).copied()));
+        }
         let pictures = list_some(&dir.join("rgb"), &PICTURES)?;
-        let mut truths = list(&dir.join("gt"), &DEPTHS)?;
+        let truths = list(&dir.join("gt"), &DEPTHS)?;
         let sparse_dir = dir.join("sparse");
-        let mut measured = if sparse_dir.is_dir() { list(&sparse_dir, &DEPTHS)? } else { Vec::new() };
+        let measured = if sparse_dir.is_dir() { list(&sparse_dir, &DEPTHS)? } else { Vec::new() };
+        let at = |name: &str, part: &str| format!("{part}/{name}.png");
+        Self::pair(pictures, truths, measured, at, |_| scale)
+    }
+
+    fn pair(
+        pictures: Listed,
+        mut truths: Listed,
+        mut measured: Listed,
+        at: impl Fn(&str, &str) -> String,
+        scale: impl Fn(&str) -> Option<DepthScale>,
+    ) -> Result<Self> {
         let mut entries = Vec::with_capacity(pictures.len());
         for (name, rgb) in pictures {
             let Some(gt) = take(&mut truths, &name) else {
-                return Err(unpaired(&rgb, "ground truth", format!("gt/{name}.png or gt/{name}.npy")));
+                return Err(unpaired(&rgb, "ground truth", format!("{} or .npy", at(&name, "gt"))));
             };
-            let sparse = take(&mut measured, &name);
-            entries.push(Entry { name, rgb, gt, sparse });
+            let (sparse, scale) = (take(&mut measured, &name), scale(&name));
+            entries.push(Entry { name, rgb, gt, sparse, scale });
         }
         truths.append(&mut measured);
-        all_taken(truths, |name| format!("rgb/{name}.png or rgb/{name}.jpg"))?;
-        Ok(Self { entries, scale: scale.into() })
+        all_taken(truths, |name| format!("{} or .jpg", at(name, "rgb")))?;
+        Ok(Self { entries })
     }
 }
 
@@ -67,8 +86,8 @@ impl Dataset for FolderDataset {
     fn load(&self, index: usize) -> Result<Sample> {
         let entry = entry(&self.entries, index)?;
         let rgb = picture(&entry.rgb)?;
-        let gt = depth(&entry.gt, self.scale, &rgb)?.as_slice().to_vec();
-        let sparse = entry.sparse.as_ref().map(|path| depth(path, self.scale, &rgb)).transpose()?;
+        let gt = depth(&entry.gt, entry.scale, &rgb)?.as_slice().to_vec();
+        let sparse = entry.sparse.as_ref().map(|path| depth(path, entry.scale, &rgb)).transpose()?;
         Ok(Sample { name: entry.name.clone(), rgb, gt, sparse, masks: Vec::new() })
     }
 }

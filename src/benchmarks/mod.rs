@@ -10,6 +10,7 @@
 
 mod ddad;
 mod files;
+mod flat;
 mod folder;
 mod hdf5;
 mod ibims;
