@@ -141,3 +141,31 @@ fn widened(bytes: &[u8], stored: DType) -> Vec<f32> {
         _ => bytes.par_chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect(),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::weights::Weights;
+    use crate::kernels::WeightFormat;
+    use candle_core::{DType, Device, Tensor};
+    use std::collections::HashMap;
+
+    #[test]
+    fn files_of_every_float_type_give_their_values() {
+        // Exact in all three types.
+        let values = [1.5f32, -0.375, 96.0, 0.0078125, -2.0, 0.0];
+        let tensor = Tensor::new(&values[..], &Device::Cpu).unwrap().reshape((2, 3)).unwrap();
+        let of = |t: Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+        for stored in [DType::F32, DType::F16, DType::BF16] {
+            let dir = tempfile::tempdir().unwrap();
+            let path = dir.path().join("w.safetensors");
+            let tensors = HashMap::from([("w", tensor.to_dtype(stored).unwrap())]);
+            candle_core::safetensors::save(&tensors, &path).unwrap();
+            for format in [WeightFormat::F32, WeightFormat::Bf16] {
+                let weights = Weights::from_file(&path, &Device::Cpu).unwrap().with_format(format);
+                assert_eq!(of(weights.get("w", &[2, 3]).unwrap()), values, "{stored:?}");
+                let matrix = weights.matrix("w", [2, 3], None).unwrap();
+                assert_eq!(of(matrix.rows(&[0, 1]).unwrap()), values, "{stored:?} as {format:?}");
+            }
+        }
+    }
+}
