@@ -1,8 +1,11 @@
 //! Attention over blocks of rows, without masks: a layout says what each row sees.
 
+use super::attention_bf16::attend;
 use super::attention_composed::composed;
 use super::attention_cpu::Attention;
 use super::exec::{dims2, expect_dims, on_cpu};
+use super::packed::WeightFormat;
+use super::packed::attend::Attend;
 use crate::error::{Error, Result};
 use candle_core::Tensor;
 use std::ops::Range;
@@ -53,6 +56,19 @@ pub struct AttentionLayout {
     pub head_dim: usize,
     /// The blocks. Query rows of no block give zeros.
     pub blocks: Vec<Block>,
+    /// What queries, keys, values and weights may be rounded to.
+    pub precision: Precision,
+}
+
+/// What the operands of attention's products may be rounded to. Sums and the softmax are f32 always.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Default)]
+pub enum Precision {
+    /// Nothing is rounded.
+    #[default]
+    F32,
+    /// To bf16, where the machine multiplies these faster and no gradient is wanted; few own keys
+    /// (up to 16) are not rounded. As [`crate::kernels::PackedWeight::linear`] does with activations.
+    Bf16,
 }
 
 /// `softmax(q k^T / sqrt(head_dim)) v` where each row sees what `layout` says.
@@ -101,8 +117,24 @@ pub fn attention(
         Some((sk, sv)) => Some((sk.contiguous()?, sv.contiguous()?)),
         None => None,
     };
+    if layout.precision == Precision::Bf16
+        && let Some(kernel) = Attend::current()
+        && ![q, k, v].iter().any(|t| t.track_op())
+    {
+        return attend(kernel, [q, k, v], shared.as_ref(), layout);
+    }
     let op = Attention::new(layout.clone(), shared);
     Ok(q.contiguous()?.apply_op3(&k.contiguous()?, &v.contiguous()?, op)?)
+}
+
+impl From<WeightFormat> for Precision {
+    /// What goes with weights of a format.
+    fn from(format: WeightFormat) -> Self {
+        match format {
+            WeightFormat::F32 => Precision::F32,
+            WeightFormat::Bf16 | WeightFormat::Int8 => Precision::Bf16,
+        }
+    }
 }
 
 impl AttentionLayout {
@@ -118,7 +150,7 @@ impl AttentionLayout {
 
 fn check(layout: &AttentionLayout, nq: usize, nk: usize, shared_rows: usize) -> Result<()> {
     let wrong = |found: String, expected: &str| Err(Error::argument("layout", found, expected));
-    let AttentionLayout { heads, kv_heads, head_dim, blocks } = layout;
+    let AttentionLayout { heads, kv_heads, head_dim, blocks, .. } = layout;
     if *kv_heads == 0 || *head_dim == 0 || *heads == 0 || heads % kv_heads != 0 {
         let found = format!("{heads} heads of {head_dim}, {kv_heads} key heads");
         return wrong(found, "heads a multiple of key heads, all at least 1");

@@ -63,18 +63,6 @@ impl Attention {
         (0..self.plan.sets.len() * kv_heads).into_par_iter().map(one).collect()
     }
 
-    /// Splits a buffer of query rows of `width` into the tiles' rows.
-    fn split<'b>(&self, mut data: &'b mut [f32], width: usize) -> Vec<&'b mut [f32]> {
-        let (mut parts, mut at) = (Vec::with_capacity(self.plan.tiles.len()), 0);
-        for tile in &self.plan.tiles {
-            let (_, rest) = data.split_at_mut((tile.rows.start - at) * width);
-            let (part, rest) = rest.split_at_mut(tile.rows.len() * width);
-            parts.push(part);
-            (data, at) = (rest, tile.rows.end);
-        }
-        parts
-    }
-
     /// Output `[nq, heads * head_dim]` and log-sum-exp `[nq, heads]`.
     fn forward(&self, data: Data<'_>) -> (Vec<f32>, Vec<f32>) {
         let AttentionLayout { heads, kv_heads, head_dim, .. } = self.layout;
@@ -82,7 +70,7 @@ impl Attention {
         let mut out = vec![0f32; data.q.len()];
         let mut lse = vec![0f32; data.q.len() / head_dim];
         let level = Level::current();
-        let (outs, lses) = (self.split(&mut out, heads * head_dim), self.split(&mut lse, heads));
+        let (outs, lses) = (self.plan.split(&mut out, heads * head_dim), self.plan.split(&mut lse, heads));
         outs.into_par_iter().zip(lses).enumerate().for_each_init(
             Scratch::default,
             |scratch, (tile, (out, lse))| {
@@ -112,7 +100,7 @@ impl Attention {
             .chunks_mut((nq * part).max(1))
             .zip(dk.chunks_mut((nk * hd).max(1)).zip(dv.chunks_mut((nk * hd).max(1))));
         for (head, (dq, (mut dk, mut dv))) in by_head.enumerate() {
-            let mut dq: Vec<_> = self.split(dq, part).into_iter().map(Some).collect();
+            let mut dq: Vec<_> = self.plan.split(dq, part).into_iter().map(Some).collect();
             let mut at = 0;
             for (span, tiles) in &spans {
                 let skip = (span.start - at) * hd;

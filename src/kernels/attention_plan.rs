@@ -5,7 +5,7 @@ use std::collections::HashMap;
 use std::ops::Range;
 
 /// Items with at most this many own keys are worked on row by row beside the shared product.
-const SHORT: usize = 16;
+pub(super) const SHORT: usize = 16;
 /// Scores of a tile, at most about so many: they should stay in the second-level cache.
 const TILE_SCORES: usize = 96 * 1024;
 
@@ -89,6 +89,18 @@ impl Plan {
         }
     }
 
+    /// Splits a buffer of query rows of `width` into the tiles' rows.
+    pub(super) fn split<'b>(&self, mut data: &'b mut [f32], width: usize) -> Vec<&'b mut [f32]> {
+        let (mut parts, mut at) = (Vec::with_capacity(self.tiles.len()), 0);
+        for tile in &self.tiles {
+            let (_, rest) = data.split_at_mut((tile.rows.start - at) * width);
+            let (part, rest) = rest.split_at_mut(tile.rows.len() * width);
+            parts.push(part);
+            (data, at) = (rest, tile.rows.end);
+        }
+        parts
+    }
+
     /// Own key rows of the first and after the last item that the tile touches.
     fn own_rows(&self, tile: usize) -> Range<usize> {
         let (rows, block) = (&self.tiles[tile].rows, &self.blocks[tile]);
@@ -134,6 +146,7 @@ fn tile_rows(width: usize, group: usize) -> usize {
 
 #[cfg(test)]
 mod tests {
+    use super::super::attention::Precision;
     use super::*;
 
     fn training(groups: usize) -> AttentionLayout {
@@ -159,7 +172,13 @@ mod tests {
                 },
             ]
         });
-        AttentionLayout { heads: 2, kv_heads: 1, head_dim: 8, blocks: blocks.collect() }
+        AttentionLayout {
+            heads: 2,
+            kv_heads: 1,
+            head_dim: 8,
+            blocks: blocks.collect(),
+            precision: Precision::F32,
+        }
     }
 
     #[test]

@@ -1,7 +1,9 @@
 //! Attention against its composed form, and its gradients.
 
-use super::attention::{AttentionLayout, Block, attention};
+use super::attention::{AttentionLayout, Block, Precision, attention};
+use super::attention_bf16::attend;
 use super::attention_composed::composed;
+use super::packed::attend::Attend;
 use super::testing::{
     at_every_level, check_gradients, close, gradients, random, same_on_any_thread_count, values,
 };
@@ -20,7 +22,7 @@ fn block(
 }
 
 fn layout(heads: usize, kv_heads: usize, head_dim: usize, blocks: Vec<Block>) -> AttentionLayout {
-    AttentionLayout { heads, kv_heads, head_dim, blocks }
+    AttentionLayout { heads, kv_heads, head_dim, blocks, precision: Precision::F32 }
 }
 
 /// q, k, v with scores that matter.
@@ -148,6 +150,143 @@ fn threads_do_not_matter() {
         all.push(attention(&t[0], &t[1], &t[2], None, &l).unwrap());
         all
     });
+}
+
+/// In f64: the weight of every key, one row and head after the other.
+fn plainly([q, k, v]: &[Tensor; 3], shared: Option<(&Tensor, &Tensor)>, l: &AttentionLayout) -> Vec<f64> {
+    let (heads, hd) = (l.heads, l.head_dim);
+    let rows = |t: &Tensor| t.to_vec2::<f32>().unwrap();
+    let (q, k, v) = (rows(q), rows(k), rows(v));
+    let (sk, sv) = shared.map_or((k.clone(), v.clone()), |(sk, sv)| (rows(sk), rows(sv)));
+    let mut out = vec![0f64; q.len() * heads * hd];
+    for b in &l.blocks {
+        for (i, row) in b.queries.clone().enumerate() {
+            let own = b.own_start + i / b.q_period * b.k_period;
+            let mut keys: Vec<(&[f32], &[f32])> =
+                b.shared.clone().map(|r| (&sk[r][..], &sv[r][..])).collect();
+            keys.extend((own..own + b.seen(i % b.q_period)).map(|r| (&k[r][..], &v[r][..])));
+            for h in 0..heads {
+                let (from, to) = (h / (heads / l.kv_heads) * hd, (row * heads + h) * hd);
+                let dot = |key: &[f32]| -> f64 {
+                    let pairs = q[row][h * hd..(h + 1) * hd].iter().zip(&key[from..from + hd]);
+                    pairs.map(|(a, b)| f64::from(*a) * f64::from(*b)).sum::<f64>() / (hd as f64).sqrt()
+                };
+                let weights: Vec<f64> = keys.iter().map(|(key, _)| dot(key).exp()).collect();
+                let total: f64 = weights.iter().sum();
+                for (w, (_, value)) in weights.iter().zip(&keys) {
+                    for c in 0..hd {
+                        out[to + c] += w / total * f64::from(value[from + c]);
+                    }
+                }
+            }
+        }
+    }
+    out
+}
+
+/// Keys in a part that fill panels and that do not, heads that do and do not, shared and own keys in all forms.
+fn bf16_cases() -> Vec<(usize, usize, AttentionLayout)> {
+    let mut cases = cases();
+    cases.extend([
+        (300, 1000, layout(4, 2, 48, vec![block(0..300, 0..700, 700, 1, 1, true)])),
+        (64, 64, layout(3, 3, 80, vec![block(0..64, 0..0, 0, 64, 64, false)])),
+        (70, 166, layout(16, 2, 128, vec![block(0..70, 0..96, 96, 35, 35, true)])),
+        (33, 97, layout(3, 1, 7, vec![block(0..33, 0..31, 31, 3, 6, true)])),
+    ]);
+    cases
+}
+
+#[test]
+fn in_bf16_it_is_the_same_to_three_digits() {
+    for (nq, nk, l) in bf16_cases() {
+        let t = qkv(nq, nk, &l);
+        let exact = plainly(&t, None, &l);
+        for kernel in Attend::every() {
+            let found = values(&attend(kernel, [&t[0], &t[1], &t[2]], None, &l).unwrap());
+            assert_eq!(found.len(), exact.len());
+            for (i, (f, e)) in found.iter().zip(&exact).enumerate() {
+                // Values below 1, of which each and its weight are rounded to 8 bits, and so are the scores' operands.
+                assert!(
+                    (f64::from(*f) - e).abs() <= 8e-3,
+                    "{nq} rows, {nk} keys, element {i}: {f}, expected {e}"
+                );
+            }
+        }
+    }
+}
+
+#[test]
+fn in_bf16_the_extra_pair_is_seen() {
+    let l = layout(4, 2, 8, vec![block(0..50, 0..21, 0, 2, 2, true), block(50..90, 5..21, 50, 40, 40, true)]);
+    let t = qkv(90, 90, &l);
+    let (sk, sv) = (random(&[21, 16], 7), random(&[21, 16], 8));
+    let exact = plainly(&t, Some((&sk, &sv)), &l);
+    for kernel in Attend::every() {
+        let found = attend(kernel, [&t[0], &t[1], &t[2]], Some(&(sk.clone(), sv.clone())), &l).unwrap();
+        for (f, e) in values(&found).iter().zip(&exact) {
+            assert!((f64::from(*f) - e).abs() <= 8e-3, "{f}, expected {e}");
+        }
+    }
+}
+
+#[test]
+fn in_bf16_a_row_depends_on_itself_only() {
+    // All rows at once, and each batch of some alone: the same bits. So it is on any number of threads.
+    let whole = layout(4, 2, 48, vec![block(0..200, 0..70, 70, 1, 1, true)]);
+    let [q, k, v] = qkv(200, 270, &whole);
+    for kernel in Attend::every() {
+        let run = |t: [&Tensor; 3], l: &AttentionLayout| attend(kernel, t, None, l).unwrap();
+        let all = run([&q, &k, &v], &whole);
+        for (from, n) in [(0, 1), (7, 5), (90, 110)] {
+            let mut part = whole.clone();
+            part.blocks = vec![block(0..n, 0..70, 70 + from, 1, 1, true)];
+            let some = run([&q.narrow(0, from, n).unwrap(), &k, &v], &part);
+            assert_eq!(values(&some), values(&all.narrow(0, from, n).unwrap()));
+        }
+        same_on_any_thread_count(|| vec![run([&q, &k, &v], &whole)]);
+    }
+}
+
+#[test]
+fn in_bf16_not_a_number_is_seen_where_it_counts() {
+    let l = layout(2, 1, 20, vec![block(0..30, 0..40, 40, 1, 1, true)]);
+    let t = qkv(30, 70, &l);
+    let poisoned = |which: usize, row: usize| {
+        let mut data = values(&t[which]);
+        let width = data.len() / t[which].dim(0).unwrap();
+        data[row * width + 3] = f32::NAN;
+        let bad = Tensor::from_vec(data, t[which].dims(), &candle_core::Device::Cpu).unwrap();
+        let mut t = t.clone();
+        t[which] = bad;
+        t
+    };
+    for kernel in Attend::every() {
+        let nan = |t: [Tensor; 3], l: &AttentionLayout| -> Vec<bool> {
+            let out = values(&attend(kernel, [&t[0], &t[1], &t[2]], None, l).unwrap());
+            out.chunks(20).map(|head| head.iter().any(|x| x.is_nan())).collect()
+        };
+        assert!(nan(t.clone(), &l).iter().all(|nan| !nan));
+        // A query's: its own row, in the head where it stands. A shared key's or value's: all rows. An own one's: its row.
+        let only = |row: usize| -> Vec<bool> { (0..60).map(|at| at / 2 == row).collect() };
+        assert_eq!(nan(poisoned(0, 5), &l), (0..60).map(|at| at == 10).collect::<Vec<_>>());
+        assert_eq!([nan(poisoned(1, 39), &l), nan(poisoned(2, 39), &l)], [vec![true; 60], vec![true; 60]]);
+        assert_eq!([nan(poisoned(1, 47), &l), nan(poisoned(2, 47), &l)], [only(7), only(7)]);
+    }
+}
+
+#[test]
+fn only_inference_is_rounded() {
+    let mut l = layout(4, 2, 48, vec![block(0..30, 0..70, 70, 1, 1, true)]);
+    let t = qkv(30, 100, &l);
+    let exact = attention(&t[0], &t[1], &t[2], None, &l).unwrap();
+    let exact_grads = gradients(&t, |t| attention(&t[0], &t[1], &t[2], None, &l));
+    l.precision = Precision::Bf16;
+    let rounded = attention(&t[0], &t[1], &t[2], None, &l).unwrap();
+    assert_eq!(values(&rounded) == values(&exact), Attend::current().is_none());
+    let grads = gradients(&t, |t| attention(&t[0], &t[1], &t[2], None, &l));
+    for (g, e) in grads.iter().zip(&exact_grads) {
+        close(g, e, 0.0);
+    }
 }
 
 #[test]

@@ -9,7 +9,7 @@ use super::matrix::Matrix;
 use super::rope::{MRope, RopeLayout, RopeTable};
 use super::weights::Weights;
 use crate::error::{Error, Result};
-use crate::kernels::{self, AttentionLayout, Block};
+use crate::kernels::{self, AttentionLayout, Block, Precision};
 use candle_core::Tensor;
 
 struct DecoderLayer {
@@ -114,6 +114,7 @@ pub struct Decoder {
     /// `[vocab, hidden]`: `lm_head`, or the embedding itself where the config ties them.
     head: Matrix,
     rope: MRope,
+    precision: Precision,
 }
 
 impl Decoder {
@@ -139,6 +140,7 @@ impl Decoder {
             norm: RmsNorm::new(weights, "model.norm", config.hidden_size, config.rms_norm_eps)?,
             head,
             rope: MRope::new(config, layout),
+            precision: weights.format().into(),
             config: config.clone(),
         })
     }
@@ -169,7 +171,13 @@ impl Decoder {
     /// The layout of heads with these blocks.
     pub fn layout(&self, blocks: Vec<Block>) -> AttentionLayout {
         let c = &self.config;
-        AttentionLayout { heads: c.heads, kv_heads: c.kv_heads, head_dim: c.head_dim(), blocks }
+        AttentionLayout {
+            heads: c.heads,
+            kv_heads: c.kv_heads,
+            head_dim: c.head_dim(),
+            blocks,
+            precision: self.precision,
+        }
     }
 
     /// All layers without the final norm: `[tokens, hidden]` to the same. `trace` receives each layer's output.

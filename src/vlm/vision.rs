@@ -9,7 +9,7 @@ use super::patch_embed::PatchEmbed;
 use super::rope::{self, RopeTable};
 use super::weights::Weights;
 use crate::error::{Error, Result};
-use crate::kernels::{self, AttentionLayout, Block};
+use crate::kernels::{self, AttentionLayout, Block, Precision};
 use candle_core::{Device, Tensor};
 use std::ops::Range;
 
@@ -58,6 +58,7 @@ pub struct VisionTower {
     ln_q: RmsNorm,
     mlp0: Linear,
     mlp2: Linear,
+    precision: Precision,
 }
 
 /// What the encoder computed at the places that golden tensors know.
@@ -123,6 +124,7 @@ impl VisionTower {
             ln_q: RmsNorm::new(weights, "visual.merger.ln_q", config.hidden_size, EPS)?,
             mlp0: Linear::new(weights, "visual.merger.mlp.0", merged, merged, true)?,
             mlp2: Linear::new(weights, "visual.merger.mlp.2", merged, config.out_hidden_size, true)?,
+            precision: weights.format().into(),
             config: config.clone(),
         })
     }
@@ -140,7 +142,8 @@ impl VisionTower {
             })
             .collect();
         let heads = self.config.heads;
-        AttentionLayout { heads, kv_heads: heads, head_dim: self.config.head_dim(), blocks }
+        let precision = self.precision;
+        AttentionLayout { heads, kv_heads: heads, head_dim: self.config.head_dim(), blocks, precision }
     }
 
     /// Encodes embedded patches `[patches, hidden]` of one or more images (V = F_theta(E), Eq. 3b) to

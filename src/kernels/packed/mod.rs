@@ -10,6 +10,7 @@
 mod amx;
 #[cfg(target_arch = "x86_64")]
 mod amx_unit;
+pub(super) mod attend;
 mod dot_bf16;
 mod dot_int8;
 mod gate;
