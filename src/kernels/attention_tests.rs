@@ -191,6 +191,11 @@ fn bf16_cases() -> Vec<(usize, usize, AttentionLayout)> {
         (300, 1000, layout(4, 2, 48, vec![block(0..300, 0..700, 700, 1, 1, true)])),
         (64, 64, layout(3, 3, 80, vec![block(0..64, 0..0, 0, 64, 64, false)])),
         (70, 166, layout(16, 2, 128, vec![block(0..70, 0..96, 96, 35, 35, true)])),
+        (
+            40,
+            40,
+            layout(2, 2, 32, (0..10).map(|i| block(4 * i..4 * i + 4, 0..0, 4 * i, 4, 4, false)).collect()),
+        ),
         (33, 97, layout(3, 1, 7, vec![block(0..33, 0..31, 31, 3, 6, true)])),
     ]);
     cases

@@ -120,11 +120,11 @@ impl Attend {
 
 #[cfg(target_arch = "x86_64")]
 mod x86 {
-    use super::super::amx::Tiles;
+    use super::super::amx::{Tiles, Unit};
     use super::super::amx_unit;
     use super::super::dot_bf16::x86::Bf16;
-    use super::super::panel::STEP_BLOCK;
-    use super::super::tile::{Operands, Tile};
+    use super::super::panel::{HALF, STEP_BLOCK};
+    use super::super::tile::{Operands, Tile, by_registers};
     use super::*;
     use std::arch::x86_64::*;
 
@@ -132,10 +132,27 @@ mod x86 {
         ($(#[$meta:meta])* $constant:ident, $tile:ty) => {
             $(#[$meta])*
             pub(super) const $constant: Attend = {
+                // A function of its own: within a larger one the compiler does not keep the sums in registers.
+                #[inline(never)]
+                #[target_feature(enable = "avx512bf16,avx512f,avx512vl,avx512dq,avx512bw,avx2,fma")]
+                unsafe fn multiply(
+                    state: &mut <$tile as Tile>::State,
+                    (rows, half): (usize, bool),
+                    operands: Operands,
+                    sums: *mut u32,
+                ) {
+                    // SAFETY: the caller's promise.
+                    unsafe {
+                        match half {
+                            true => <$tile as Halves>::half(state, rows, operands, sums),
+                            false => <$tile as Tile>::multiply(state, rows, operands, sums),
+                        }
+                    }
+                }
                 #[target_feature(enable = "avx512bf16,avx512f,avx512vl,avx512dq,avx512bw,avx2,fma")]
                 unsafe fn run(rows: Rows<'_>, space: &mut Space) {
                     // SAFETY: the caller's promise.
-                    unsafe { attend::<$tile>(rows, space) }
+                    unsafe { attend::<$tile>(rows, space, multiply) }
                 }
                 Attend { rows: <$tile as Tile>::ROWS, run }
             };
@@ -148,6 +165,40 @@ mod x86 {
         EMULATED,
         Tiles<super::super::amx::Emulated, false>
     );
+
+    /// [`Tile::multiply`], by whole panels or by their first half.
+    type Multiply<S> = unsafe fn(&mut S, (usize, bool), Operands, *mut u32);
+
+    /// Half panels.
+    trait Halves: Tile {
+        /// [`Tile::multiply`], of which only the first half of the channels is wanted.
+        ///
+        /// # Safety
+        /// As there.
+        #[inline(always)]
+        unsafe fn half(state: &mut Self::State, rows: usize, operands: Operands, sums: *mut u32) {
+            // SAFETY: the caller's promise.
+            unsafe { Self::multiply(state, rows, operands, sums) }
+        }
+    }
+
+    impl<U: Unit> Halves for Tiles<U, false> {}
+
+    impl Halves for Bf16 {
+        #[inline(always)]
+        unsafe fn half(_: &mut (), rows: usize, operands: Operands, sums: *mut u32) {
+            macro_rules! by_rows {
+                ($($rows:literal)+) => {
+                    match rows {
+                        // SAFETY: the caller's promise.
+                        $($rows => unsafe { by_registers::<Bf16, $rows, 1>(operands, sums) },)+
+                        _ => {}
+                    }
+                };
+            }
+            by_rows!(1 2 3 4 5 6 7 8 9 10 11 12);
+        }
+    }
 
     /// Where the matrices of a call lie in its buffer, in words.
     struct Shape {
@@ -184,9 +235,9 @@ mod x86 {
     }
 
     /// # Safety
-    /// The CPU must have `T`'s instructions and AVX512-BF16.
+    /// The CPU must have `T`'s instructions and AVX512-BF16; `multiply` must be `T`'s.
     #[inline(always)]
-    unsafe fn attend<T: Tile>(job: Rows<'_>, space: &mut Space) {
+    unsafe fn attend<T: Tile>(job: Rows<'_>, space: &mut Space, multiply: Multiply<T::State>) {
         let shape = Shape::new::<T>(&job);
         check::<T>(&job, &shape);
         if space.words.len() < shape.end + 15 {
@@ -212,14 +263,9 @@ mod x86 {
                     let to = &mut scores[panel * shape.rows * WIDTH..][..shape.rows * WIDTH];
                     to.fill(0);
                     let right = right[p * length..(p + 1) * length].as_ptr();
-                    let next = right.wrapping_add(length);
                     let (left, stride, steps) = (q.as_ptr(), shape.steps, shape.steps);
-                    T::multiply(
-                        &mut state,
-                        shape.rows,
-                        Operands { left, stride, right, next, steps },
-                        to.as_mut_ptr(),
-                    );
+                    let operands = Operands { left, stride, right, next: right, steps };
+                    multiply(&mut state, (shape.rows, false), operands, to.as_mut_ptr());
                     panel += 1;
                 }
             }
@@ -230,15 +276,15 @@ mod x86 {
             }
             for column in (0..job.head_dim).step_by(WIDTH) {
                 sums.fill(0);
+                let half = job.head_dim - column <= HALF;
                 let mut panel = 0;
                 for (part, panels) in job.parts.iter().zip(shape.panels) {
                     let steps = panels * PANEL_WORDS;
                     let from = column * part.keys.steps;
                     let right = part.keys.values.get()[from..from + steps * WIDTH].as_ptr();
-                    let next = right.wrapping_add(part.keys.steps * WIDTH);
                     let left = weights[panel * PANEL_WORDS..].as_ptr();
-                    let operands = Operands { left, stride: shape.stride, right, next, steps };
-                    T::multiply(&mut state, shape.rows, operands, sums.as_mut_ptr());
+                    let operands = Operands { left, stride: shape.stride, right, next: right, steps };
+                    multiply(&mut state, (shape.rows, half), operands, sums.as_mut_ptr());
                     panel += panels;
                 }
                 let count = WIDTH.min(job.head_dim - column);
@@ -279,7 +325,7 @@ mod x86 {
     ) -> f32 {
         // From panel to panel.
         let jump = shape.rows * WIDTH;
-        let scores = scores[row * WIDTH..].as_mut_ptr().cast::<f32>();
+        let scores = scores.as_mut_ptr().wrapping_add(row * WIDTH).cast::<f32>();
         // SAFETY: the caller's promise; panels end within the scores and the weights, a row of `GIVEN` is 16 elements.
         unsafe {
             let mut maxima = [_mm512_set1_ps(f32::NEG_INFINITY); 2];

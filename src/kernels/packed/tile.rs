@@ -152,7 +152,10 @@ fn opaque(pointer: *const u32) -> *const u32 {
 /// # Safety
 /// As [`Tile::multiply`], for `ROWS` rows and `COLUMNS` registers of channels.
 #[inline(always)]
-unsafe fn by_registers<D: Dot, const ROWS: usize, const COLUMNS: usize>(operands: Operands, sums: *mut u32) {
+pub(super) unsafe fn by_registers<D: Dot, const ROWS: usize, const COLUMNS: usize>(
+    operands: Operands,
+    sums: *mut u32,
+) {
     let Operands { left, stride, mut right, mut next, steps } = operands;
     let mut left: [*const u32; POINTERS] =
         std::array::from_fn(|p| left.wrapping_add((p * SHARING).min(ROWS - 1) * stride));
