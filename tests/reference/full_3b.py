@@ -2,12 +2,14 @@
 """A checkpoint of the full Qwen2.5-VL-3B shapes with random bf16 weights, and what the reference answers with it.
 
     pip install -r tests/reference/requirements.txt
-    python tests/reference/full_3b.py write DIR TOKENIZER      7.5 GB of shards, a frame and a question into DIR
+    python tests/reference/full_3b.py write DIR TOKENIZER      7.5 GB of shards, a frame, 10 measurements and a question into DIR
     python tests/reference/full_3b.py run DIR f32              about 17 GB of memory, minutes; writes reference_f32.json
     python tests/reference/full_3b.py run DIR bf16             about 9 GB; writes reference_bf16.json
     cargo run --release --example ask -- --model DIR --image DIR/frame.png --prompt "$(cat DIR/question.txt)" \
         --max-new-tokens 8 --repetition-penalty 1 --json > ours.json
     python tests/reference/full_3b.py compare DIR/reference_f32.json ours.json
+    cargo run --release --example complete -- --model DIR --rgb DIR/frame.png --sparse DIR/sparse.npy \
+        --plan budget:64 --weights bf16 --json          64 pixels by the paper's prompt, 10 measurements asked beside them
 
 TOKENIZER is a directory with the published `tokenizer.json`, `tokenizer_config.json`, `chat_template.json` and
 `preprocessor_config.json`. `compare` needs nothing but Python: same prompt, the 20 best ids of the first token the same
@@ -86,6 +88,7 @@ def values_of(name, shape, generator):
 
 
 def write(out, tokenizer):
+    import numpy as np
     import torch
     import transformers
 
@@ -114,6 +117,10 @@ def write(out, tokenizer):
             shutil.copyfile(tokenizer / name, out / name)
     picture().save(out / "frame.png")
     (out / "question.txt").write_text(QUESTION)
+    rng = np.random.default_rng(10)
+    sparse = np.zeros((480, 640), np.float32)
+    sparse.flat[rng.choice(sparse.size, 10, replace=False)] = rng.uniform(1, 9, 10)
+    np.save(out / "sparse.npy", sparse)
 
 
 def inputs_of(out):
