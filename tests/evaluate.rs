@@ -1,6 +1,8 @@
 //! The example program `evaluate`: scores, resuming, shards, figures, bad arguments.
 
 mod common;
+#[path = "common/copies.rs"]
+mod copies;
 
 use common::program;
 use serde_json::Value;
@@ -147,8 +149,10 @@ fn results_of_other_settings_are_not_mixed() {
     let folder = Folder::new(2);
     succeeded(folder.classical("a", &[]));
     let before = results(&folder.path("a"));
-    let cases: [(&[&str], &str); 4] = [
+    let cases: [(&[&str], &str); 6] = [
         (&["--seed", "3"], "`seed`"),
+        (&["--score", "all"], "`score`"),
+        (&["--resample"], "`resample`"),
         (&["--pattern", "sfm"], "`pattern`"),
         (&["--limit", "1"], "`frames`"),
         (&["--range", "1,5"], "`range`"),
@@ -176,6 +180,135 @@ fn frames_that_cannot_be_scored_are_named() {
 }
 
 #[test]
+fn measured_pixels_count_if_asked() {
+    let folder = Folder::new(2);
+    let report = |out: &str, more: &[&str]| -> (Value, String) {
+        let ran = succeeded(folder.classical(out, &[&["--json"], more].concat()));
+        let text = fs::read_to_string(folder.path(out).join("report.md")).unwrap();
+        (serde_json::from_slice(&ran.stdout).unwrap(), text)
+    };
+    let (unseen, unseen_text) = report("unseen", &[]);
+    let (everywhere, everywhere_text) = report("all", &["--score", "all"]);
+    assert_eq!(
+        (&unseen["settings"]["score"], &everywhere["settings"]["score"]),
+        (&"unseen".into(), &"all".into())
+    );
+    assert!(unseen_text.contains("that were not measured (`--score unseen`)"), "{unseen_text}");
+    assert!(everywhere_text.contains("measured ones included (`--score all`)"), "{everywhere_text}");
+    // Both methods keep what was measured, so the same errors are spread over more pixels.
+    let pixels = |out: &str| -> Vec<(f64, f64)> {
+        let csv = fs::read_to_string(folder.path(out).join("frames.csv")).unwrap();
+        let lines = csv.lines().skip(1).map(|l| l.split(',').map(str::to_string).collect::<Vec<_>>());
+        lines.map(|l| (l[4].parse().unwrap(), l[6].parse().unwrap())).collect()
+    };
+    let (few, many) = (pixels("unseen"), pixels("all"));
+    assert_eq!(few.len(), 2 * 2 * 2);
+    for (row, (few, many)) in few.iter().zip(&many).enumerate() {
+        assert_eq!(many.0 - few.0, if row < 4 { 30.0 } else { 60.0 }, "row {row}");
+        assert!((few.0 * few.1 - many.0 * many.1).abs() < 1e-6 * few.0, "row {row}: {few:?} {many:?}");
+    }
+    let regions = |v: &Value| v["tables"][0]["methods"][0]["regions"].clone();
+    assert_eq!(regions(&unseen), regions(&everywhere));
+
+    // Where all truth was the input, all methods are perfect, and even a model has no confidence to judge.
+    fs::create_dir(folder.path("data/sparse")).unwrap();
+    for truth in fs::read_dir(folder.path("data/gt")).unwrap() {
+        let truth = truth.unwrap().path();
+        fs::copy(&truth, folder.path("data/sparse").join(truth.file_name().unwrap())).unwrap();
+    }
+    let ran = folder.evaluate(&[
+        "--methods",
+        "sdim-tiny,nearest",
+        "--plan",
+        "budget:9",
+        "--score",
+        "all",
+        "--json",
+    ]);
+    let v: Value = serde_json::from_slice(&succeeded(ran).stdout).unwrap();
+    assert_eq!(
+        (&v["tables"][0]["frames"], &v["tables"][0]["own"], &v["tables"][0]["points"]),
+        (&2.into(), &2.into(), &0.into())
+    );
+    assert_eq!(v["tables"][0]["methods"][0]["metrics"]["mae"]["value"], 0.0);
+    assert!(v["tables"][0]["methods"][0]["regions"].as_array().unwrap().is_empty());
+}
+
+/// The report of a run over a copy of a benchmark.
+fn benchmark(layout: &str, data: &Path, out: &Path, more: &[&str]) -> Output {
+    let base = [
+        "--layout",
+        layout,
+        "--data",
+        text(data),
+        "--methods",
+        "nearest,linear",
+        "--out",
+        text(out),
+        "--json",
+    ];
+    Command::new(program("evaluate")).args(base).args(more).output().unwrap()
+}
+
+#[test]
+fn every_layout_is_scored() {
+    let dir = tempfile::tempdir().unwrap();
+    let at = |name: &str| dir.path().join(name);
+    let (kitti, ddad, drawn, void) =
+        (copies::kitti(), copies::ddad(true), copies::ddad(false), copies::void());
+    copies::tum(&at("tum"));
+    copies::scannet(&at("scannet"));
+    let fixture =
+        |name: &str| Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/benchmarks").join(name);
+    // Layout, place, frames, and measured pixels per frame where they are the data set's own.
+    let cases: [(&str, PathBuf, usize, Option<f64>); 9] = [
+        ("kitti", kitti.path().into(), 2, Some(3.0)),
+        ("ddad", ddad.path().into(), 2, Some(1.0)),
+        ("ddad", drawn.path().into(), 2, Some(39.0)),
+        ("void", void.path().join("void_150"), 2, Some(15.0)),
+        ("nyu", fixture("nyu_bundle"), 2, None),
+        ("nyu", fixture("nyu"), 1, None),
+        ("ibims", fixture("ibims"), 2, None),
+        ("tum", at("tum"), 2, None),
+        ("scannet", at("scannet"), 3, None),
+    ];
+    for (case, (layout, data, frames, own)) in cases.into_iter().enumerate() {
+        let own_points = own.is_some() || data.ends_with("nyu_bundle");
+        let out = |kind: &str| at(&format!("out/{case}-{kind}"));
+        let read = |ran: Output| -> Value {
+            let v: Value = serde_json::from_slice(&succeeded(ran).stdout).unwrap();
+            let table = v["tables"][0].clone();
+            assert_eq!(
+                (&v["settings"]["layout"], &table["frames"]),
+                (&layout.into(), &frames.into()),
+                "{layout}"
+            );
+            for method in table["methods"].as_array().unwrap() {
+                assert!(
+                    method["metrics"]["rmse"]["value"].as_f64().unwrap() >= 0.0 && method["missing"] == 0
+                );
+            }
+            table
+        };
+        if own_points {
+            let table = read(benchmark(layout, &data, &out("own"), &[]));
+            assert_eq!((&table["own"], &table["points"]), (&frames.into(), &0.into()), "{layout}");
+            assert!(own.is_none_or(|n| table["measured"] == n), "{layout}: {}", table["measured"]);
+            let markdown = fs::read_to_string(out("own").join("report.md")).unwrap();
+            assert!(markdown.contains("## The data set's own measurements"), "{markdown}");
+            for more in [["--points", "10"], ["--pattern", "uniform"]] {
+                let ran = benchmark(layout, &data, &out("refused"), &more);
+                assert!(!ran.status.success() && !out("refused").exists(), "{layout} {more:?}");
+                assert!(said(&ran).contains(more[0]) && said(&ran).contains("--resample"), "{}", said(&ran));
+            }
+        }
+        let more = if own_points { &["--points", "10", "--resample"][..] } else { &["--points", "10"] };
+        let table = read(benchmark(layout, &data, &out("drawn"), more));
+        assert_eq!((&table["own"], &table["measured"]), (&0.into(), &10.0.into()), "{layout}");
+    }
+}
+
+#[test]
 fn figures_are_drawn_once() {
     let folder = Folder::new(3);
     let figures = folder.path("figures");
@@ -197,7 +330,8 @@ fn figures_are_drawn_once() {
 fn bad_arguments_are_named_and_nothing_is_written() {
     let folder = Folder::new(1);
     let out = folder.path("out");
-    let cases: [(&[&str], &str); 14] = [
+    let cases: [(&[&str], &str); 15] = [
+        (&["--score", "some"], "unseen, all"),
         (&["--layout", "cityscapes"], "cityscapes"),
         (&["--points", "0"], "--points 0"),
         (&["--points", "many"], "many"),
@@ -220,7 +354,11 @@ fn bad_arguments_are_named_and_nothing_is_written() {
     }
     let evaluate = |args: &[&str]| Command::new(program("evaluate")).args(args).output().unwrap();
     let absent = folder.path("absent");
-    let alone: [(&[&str], &str); 4] = [
+    let alone: [(&[&str], &str); 7] = [
+        // What would change nothing is not taken without a word.
+        (&["--merge", "a", "--score", "all"], "--score"),
+        (&["--merge", "a", "--points", "100"], "--points"),
+        (&["--procedural", "2", "--range", "1,5"], "--range"),
         (&[], "--data"),
         (&["--data", text(&absent)], "absent"),
         (&["--merge", text(&absent)], "absent"),

@@ -19,6 +19,18 @@ pub fn open(args: &Args) -> anyhow::Result<Box<dyn Dataset>> {
     }
 }
 
+/// How many frames are asked for.
+pub fn count(args: &Args, frames: &dyn Dataset) -> anyhow::Result<usize> {
+    let count = frames.len().min(args.limit.unwrap_or(usize::MAX));
+    anyhow::ensure!(count > 0, "--limit 0: expected at least 1 frame");
+    Ok(count)
+}
+
+/// Whether all of them bring their measurements.
+pub fn all_own(args: &Args, frames: &dyn Dataset) -> anyhow::Result<bool> {
+    Ok((0..count(args, frames)?).all(|i| frames.has_measurements(i)))
+}
+
 /// Scenes that training never saw.
 struct Procedural(usize);
 
@@ -29,6 +41,10 @@ impl Dataset for Procedural {
 
     fn name(&self, index: usize) -> String {
         format!("scene-{index}")
+    }
+
+    fn has_measurements(&self, _: usize) -> bool {
+        false
     }
 
     fn load(&self, index: usize) -> sdim::Result<Sample> {

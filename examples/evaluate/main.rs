@@ -2,10 +2,33 @@
 //!
 //! `cargo run --release --example evaluate -- --layout folder --data DIR --points 100,500 --out RESULTS`
 //!
-//! Errors are over ground-truth pixels that were not given as input. Each frame's scores are one small file under `--out`, so a run
+//! Errors are over ground-truth pixels that were not given as input; the tables of Marigold-DC, and those compared with them, count
+//! all of them: `--score all`. Each frame's scores are one small file under `--out`, so a run
 //! that was stopped goes on where it was, and `--shard I/N` spreads a data set over machines; `--merge` makes one report of them.
 //! report.md, report.json and frames.csv depend on the scores alone and are the same, byte for byte, however the work was divided;
 //! times and memory stand in speed.json and are printed to stderr.
+//!
+//! # On a cluster
+//!
+//! Any array of jobs will do: they share nothing but the folder `--out`, which may also be one per job. Build first, so that no job
+//! compiles, and give all jobs the same arguments. A job that was killed is sent again as it was and goes on where it stopped.
+//!
+//! SLURM, 16 jobs, and one for the report after they all went well:
+//!
+//! ```sh
+//! run="target/release/examples/evaluate --layout void --data /data/void_1500 --out /results/void_1500"
+//! jobs=$(sbatch --parsable --array=0-15 --wrap "$run --shard \$SLURM_ARRAY_TASK_ID/16")
+//! sbatch --dependency=afterok:$jobs --wrap "target/release/examples/evaluate --merge /results/void_1500 --out /results/void_1500"
+//! ```
+//!
+//! Kubernetes, an indexed Job: `completionMode: Indexed`, `completions: 16`, `parallelism` as many as there is room for, a volume
+//! that all can write to at `/results`, and as the container's command, in the form that a shell reads for the index:
+//!
+//! ```sh
+//! sh -c 'exec evaluate --layout void --data /data/void_1500 --out /results/void_1500 --shard "$JOB_COMPLETION_INDEX/16"'
+//! ```
+//!
+//! then `--merge` as above in a Job of its own. It names what is missing when not all shards are done.
 
 #[path = "../common/mod.rs"]
 mod common;
@@ -18,11 +41,12 @@ mod run;
 mod settings;
 mod speed;
 
-use anyhow::{Context, bail};
+use anyhow::{Context, bail, ensure};
 use clap::Parser;
 use sdim::benchmarks::Layout;
 use sdim::scenes::SparsePattern;
 use sdim::{DepthScale, QueryPlan};
+use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 use std::str::FromStr;
 
@@ -40,7 +64,7 @@ pub struct Args {
     #[arg(long, required_unless_present_any = ["procedural", "merge"])]
     data: Option<PathBuf>,
     /// Score on this many held-out procedural scenes of 320x240 instead.
-    #[arg(long, conflicts_with = "data")]
+    #[arg(long, conflicts_with_all = ["data", "layout", "depth_scale", "range", "resample"])]
     procedural: Option<usize>,
     /// Unit of integer depth files of layout folder: mm, kitti, tum or units per metre.
     #[arg(long)]
@@ -49,12 +73,19 @@ pub struct Args {
     #[arg(long, value_parser = pair)]
     range: Option<(f32, f32)>,
     /// Points drawn from the ground truth where a frame has no measurements of its own; several: 100,500,1500. Default: what
-    /// the benchmark's protocol says, else 500.
+    /// the benchmark's protocol says, else 500. An error where all frames have their own (void, kitti, ddad, nyu with its hints).
     #[arg(long, value_delimiter = ',')]
     points: Vec<usize>,
-    /// How they are spread: uniform, lidar:LINES or sfm.
-    #[arg(long, default_value = "uniform")]
-    pattern: String,
+    /// How they are spread: uniform (the default), lidar:LINES or sfm.
+    #[arg(long)]
+    pattern: Option<String>,
+    /// Draw points from the ground truth even where a frame has measurements of its own.
+    #[arg(long)]
+    resample: bool,
+    /// Pixels with ground truth that count: unseen leaves out those given as input, all does not (as Marigold-DC's script, and so
+    /// the tables that are compared with it).
+    #[arg(long, value_enum, default_value_t = Score::Unseen)]
+    score: Score,
     /// Seed of the drawn points.
     #[arg(long, default_value_t = 0)]
     seed: u64,
@@ -84,7 +115,9 @@ pub struct Args {
     #[arg(long, requires = "out", value_name = "I/N")]
     shard: Option<Shard>,
     /// Make the report of finished runs or shards instead of running; into --out if given.
-    #[arg(long, num_args = 1.., value_name = "DIR", conflicts_with_all = ["data", "procedural", "shard", "figures"])]
+    #[arg(long, num_args = 1.., value_name = "DIR", conflicts_with_all = [
+        "data", "procedural", "layout", "depth_scale", "range", "points", "pattern", "resample", "score", "seed", "limit",
+        "checkpoint", "adapter", "methods", "plan", "device", "shard", "figures", "verbose"])]
     merge: Vec<PathBuf>,
     /// Draw the first frames into this folder, all methods and their errors beside each other.
     #[arg(long)]
@@ -101,6 +134,16 @@ pub struct Args {
     /// Print each frame's MAE of each method to stderr.
     #[arg(long)]
     verbose: bool,
+}
+
+/// Pixels that count in the errors.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Score {
+    /// With ground truth, not measured.
+    Unseen,
+    /// With ground truth.
+    All,
 }
 
 /// A part of the frames: those whose index leaves `index` when divided by `of`.
@@ -129,8 +172,18 @@ fn pair(text: &str) -> Result<(f32, f32), String> {
 }
 
 impl Args {
-    /// What was asked for that the data set does not decide.
-    fn points(&self) -> anyhow::Result<Vec<usize>> {
+    /// Numbers of points to draw; 0 alone where nothing is drawn, since all frames have their own.
+    fn points(&self, all_own: bool) -> anyhow::Result<Vec<usize>> {
+        if all_own && !self.resample {
+            let flag = if self.points.is_empty() { "--pattern" } else { "--points" };
+            ensure!(
+                self.points.is_empty() && self.pattern.is_none(),
+                "{flag}: nothing is drawn, all frames of layout {} have measurements of their own; expected --resample beside \
+                 it, to draw from the ground truth instead",
+                self.layout
+            );
+            return Ok(vec![0]);
+        }
         let mut points = self.points.clone();
         if points.is_empty() {
             points.push(self.layout.points().unwrap_or(500));
@@ -144,7 +197,11 @@ impl Args {
     }
 
     fn pattern(&self) -> anyhow::Result<SparsePattern> {
-        self.pattern.parse().context("--pattern")
+        self.pattern_name().parse().context("--pattern")
+    }
+
+    fn pattern_name(&self) -> &str {
+        self.pattern.as_deref().unwrap_or("uniform")
     }
 }
 

@@ -26,6 +26,7 @@ pub struct Tables {
 /// All methods with one number of points.
 #[derive(Debug, Serialize)]
 pub struct Table {
+    /// As asked for; 0: those of the data set.
     pub points: usize,
     /// Frames scored.
     pub frames: usize,
@@ -242,7 +243,7 @@ impl Values {
     fn table(&self, reference: &Values) -> MethodTable {
         let metrics = METRICS.iter().zip(&self.metrics);
         let region = |r: &RegionTable| {
-            let n = r.frames.max(1) as f64;
+            let n = r.frames as f64;
             let (name, mae, rmse, abs_rel) = (r.name.clone(), r.mae / n, r.rmse / n, r.abs_rel / n);
             RegionTable { name, frames: r.frames, pixels: r.pixels, mae, rmse, abs_rel }
         };
@@ -254,7 +255,7 @@ impl Values {
             gradient_error: bootstrap_mean(&self.gradient_error, SEED),
             mae_ratio: bootstrap_ratio(&self.metrics[0], &reference.metrics[0], SEED),
             missing: self.missing,
-            regions: self.regions.iter().map(region).collect(),
+            regions: self.regions.iter().filter(|r| r.frames > 0).map(region).collect(),
             confidence: self.confidence.iter().map(|(k, (s, n))| (k.clone(), s / *n as f64)).collect(),
         }
     }

@@ -4,13 +4,14 @@ use crate::methods::{Answer, Method};
 use crate::record::{self, Confidence, Cost, Record, Scores, read_json, write_json};
 use crate::report::Report;
 use crate::settings::Settings;
-use crate::{Args, Shard, figures, frames, methods, speed};
+use crate::{Args, Score, Shard, figures, frames, methods, speed};
 use anyhow::Context;
 use indicatif::{ProgressBar, ProgressStyle};
 use sdim::SparseDepth;
 use sdim::benchmarks::{Dataset, Sample, frame_seed};
 use sdim::depth::metrics::{
-    DISTANCE_LIMITS, EdgeRule, Regions, errors, errors_in, gradient_error, score_confidence,
+    DISTANCE_LIMITS, EdgeRule, Regions, errors, errors_everywhere, errors_in, gradient_error,
+    score_confidence,
 };
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -21,9 +22,9 @@ const CONFIDENT_WITHIN: f64 = 0.05;
 /// Runs what is not done yet. The report, unless this was a shard of something larger.
 pub fn run(args: &Args) -> anyhow::Result<Option<Report>> {
     // What is cheap to check comes first: a checkpoint may take minutes to load.
-    args.points()?;
     args.pattern()?;
     let frames = frames::open(args)?;
+    args.points(frames::all_own(args, frames.as_ref())?)?;
     let methods = methods::load_all(args)?;
     let settings = Settings::new(args, frames.as_ref(), &methods)?;
     // Removed at the end, where nothing is to be kept.
@@ -90,7 +91,10 @@ impl Task<'_> {
     }
 
     fn score(&self, figure: Option<&Path>) -> anyhow::Result<Record> {
-        let sample = self.frames.load(self.index)?;
+        let mut sample = self.frames.load(self.index)?;
+        if self.args.resample {
+            sample.sparse = None;
+        }
         let (width, height) = (sample.rgb.width() as usize, sample.rgb.height() as usize);
         let mut record = Record {
             index: self.index,
@@ -110,23 +114,26 @@ impl Task<'_> {
         let seed = frame_seed(self.args.seed, self.index);
         let sparse = sample.measurements(self.points, self.args.pattern()?, seed)?;
         record.measured = sparse.measured();
-        let to_score = |(t, s): (&f32, &f32)| t.is_finite() && *t > 0.0 && s.is_nan();
-        if sparse.measured() == 0 || !sample.gt.iter().zip(sparse.as_slice()).any(to_score) {
-            record.skipped = Some("no measurement, or none left to predict".to_string());
+        if sparse.measured() == 0 {
+            record.skipped = Some("no measurement".to_string());
             return Ok(record);
         }
-        let regions = regions(&sample, &sparse)?;
+        let frame = Frame::new(sample, sparse, self.args.score)?;
+        if frame.score == Score::Unseen && !frame.unseen {
+            record.skipped = Some("no pixel left to predict".to_string());
+            return Ok(record);
+        }
         let mut drawn = Vec::new();
         for method in self.methods {
-            let (answer, cost) = measure(|| method.complete(&sample.rgb, &sparse))?;
-            record.scores.push(judge(method, &answer, &sample, &sparse, &regions)?);
+            let (answer, cost) = measure(|| method.complete(&frame.sample.rgb, &frame.sparse))?;
+            record.scores.push(frame.judge(method, &answer)?);
             record.cost.push(cost);
             if figure.is_some() {
                 drawn.push((method.name.clone(), answer.depth().to_vec()));
             }
         }
         if let Some(path) = figure {
-            figures::write(path, &sample, &sparse, &drawn, self.args.figure_tile)?;
+            figures::write(path, &frame.sample, &frame.sparse, &drawn, self.args.figure_tile)?;
         }
         Ok(record)
     }
@@ -140,39 +147,53 @@ fn measure(work: impl FnOnce() -> sdim::Result<Answer>) -> anyhow::Result<(Answe
     Ok((answer, Cost { seconds, peak_bytes: sdim::system::peak_rss_bytes() }))
 }
 
-/// The frame taken apart: by distance, at edges, and by the masks that the data set has.
-fn regions(sample: &Sample, sparse: &SparseDepth) -> sdim::Result<Vec<Regions>> {
-    let mut all = vec![
-        Regions::by_distance(sparse, &DISTANCE_LIMITS)?,
-        Regions::at_edges(&sample.gt, sparse, &EdgeRule::default())?,
-    ];
-    for mask in &sample.masks {
-        all.push(Regions::by_mask(mask.name, &mask.pixels, sparse)?);
-    }
-    Ok(all)
+/// What answers are compared with.
+struct Frame {
+    sample: Sample,
+    sparse: SparseDepth,
+    score: Score,
+    /// Whether any pixel has ground truth and was not measured.
+    unseen: bool,
+    /// Taken apart by distance, at edges, and by the masks that the data set has; measured pixels are in none.
+    regions: Vec<Regions>,
 }
 
-fn judge(
-    method: &Method,
-    answer: &Answer,
-    sample: &Sample,
-    sparse: &SparseDepth,
-    regions: &[Regions],
-) -> anyhow::Result<Scores> {
-    let (depth, truth) = (answer.depth(), &sample.gt);
-    let mut by_region = Vec::new();
-    for regions in regions {
-        by_region.extend(regions.names().iter().cloned().zip(errors_in(depth, truth, regions)?));
+impl Frame {
+    fn new(sample: Sample, sparse: SparseDepth, score: Score) -> sdim::Result<Self> {
+        let mut regions = vec![
+            Regions::by_distance(&sparse, &DISTANCE_LIMITS)?,
+            Regions::at_edges(&sample.gt, &sparse, &EdgeRule::default())?,
+        ];
+        for mask in &sample.masks {
+            regions.push(Regions::by_mask(mask.name, &mask.pixels, &sparse)?);
+        }
+        let to_predict = |(t, s): (&f32, &f32)| t.is_finite() && *t > 0.0 && s.is_nan();
+        let unseen = sample.gt.iter().zip(sparse.as_slice()).any(to_predict);
+        Ok(Self { sample, sparse, score, unseen, regions })
     }
-    let confidence = match answer {
-        Answer::Map(map) => Some(Confidence::from(score_confidence(map, truth, CONFIDENT_WITHIN)?)),
-        Answer::Depth(_) => None,
-    };
-    Ok(Scores {
-        method: method.name.clone(),
-        errors: errors(depth, truth, sparse).with_context(|| method.name.clone())?,
-        gradient_error: gradient_error(depth, truth, sparse.width(), sparse.height())?,
-        regions: by_region,
-        confidence,
-    })
+
+    fn judge(&self, method: &Method, answer: &Answer) -> anyhow::Result<Scores> {
+        let (depth, truth, sparse) = (answer.depth(), &self.sample.gt, &self.sparse);
+        let mut regions = Vec::new();
+        for part in &self.regions {
+            regions.extend(part.names().iter().cloned().zip(errors_in(depth, truth, part)?));
+        }
+        let confidence = match answer {
+            Answer::Map(map) if self.unseen => {
+                Some(Confidence::from(score_confidence(map, truth, CONFIDENT_WITHIN)?))
+            }
+            Answer::Map(_) | Answer::Depth(_) => None,
+        };
+        let errors = match self.score {
+            Score::Unseen => errors(depth, truth, sparse),
+            Score::All => errors_everywhere(depth, truth),
+        };
+        Ok(Scores {
+            method: method.name.clone(),
+            errors: errors.with_context(|| method.name.clone())?,
+            gradient_error: gradient_error(depth, truth, sparse.width(), sparse.height())?,
+            regions,
+            confidence,
+        })
+    }
 }

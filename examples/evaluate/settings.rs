@@ -2,7 +2,7 @@
 
 use crate::methods::Method;
 use crate::record::{read_json, write_json};
-use crate::{Args, record};
+use crate::{Args, Score, frames as source, record};
 use anyhow::{Context, ensure};
 use sdim::benchmarks::Dataset;
 use serde::{Deserialize, Serialize};
@@ -19,8 +19,12 @@ pub struct Settings {
     /// Number of frames, and a number made from their names.
     pub frames: usize,
     pub names: String,
+    /// 0: those of the data set.
     pub points: Vec<usize>,
     pub pattern: String,
+    /// Whether points are drawn where frames have their own.
+    pub resample: bool,
+    pub score: Score,
     pub seed: u64,
     pub range: Option<(f32, f32)>,
     /// Units per metre of integer files, if given.
@@ -32,8 +36,7 @@ pub struct Settings {
 
 impl Settings {
     pub fn new(args: &Args, frames: &dyn Dataset, methods: &[Method]) -> anyhow::Result<Self> {
-        let count = frames.len().min(args.limit.unwrap_or(usize::MAX));
-        ensure!(count > 0, "--limit 0: expected at least 1 frame");
+        let count = source::count(args, frames)?;
         let mut names = Fnv::default();
         (0..count).for_each(|i| names.add(frames.name(i).as_bytes()));
         Ok(Self {
@@ -41,8 +44,10 @@ impl Settings {
             layout: if args.data.is_some() { args.layout.name() } else { "procedural" }.to_string(),
             frames: count,
             names: names.text(),
-            points: args.points()?,
-            pattern: args.pattern.clone(),
+            points: args.points(source::all_own(args, frames)?)?,
+            pattern: args.pattern_name().to_string(),
+            resample: args.resample,
+            score: args.score,
             seed: args.seed,
             range: args.range,
             depth_scale: args.depth_scale.map(|s| s.units()),

@@ -51,8 +51,11 @@ impl Speed {
     pub fn table(&self) -> String {
         let mut text = String::new();
         for (points, methods) in &self.points {
-            let points = points.trim_start_matches('0');
-            let _ = writeln!(text, "\n{points} points{:14} frames/s   slowest s   memory MB   RMSE m", "");
+            let title = match points.trim_start_matches('0') {
+                "" => "own points".to_string(),
+                points => format!("{points} points"),
+            };
+            let _ = writeln!(text, "\n{title:24} frames/s   slowest s   memory MB   RMSE m");
             for (name, s) in methods {
                 let memory = s.peak_bytes.map_or("?".to_string(), |b| format!("{:.0}", b as f64 / 1e6));
                 let (rate, slowest) = (s.frames_per_second, s.slowest_seconds);

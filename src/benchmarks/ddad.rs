@@ -65,6 +65,10 @@ impl Dataset for DdadDataset {
         self.entries.get(index).map(|e| e.name.clone()).unwrap_or_default()
     }
 
+    fn has_measurements(&self, index: usize) -> bool {
+        index < self.entries.len()
+    }
+
     fn load(&self, index: usize) -> Result<Sample> {
         let Entry { name, rgb, gt: gt_path, hints } = entry(&self.entries, index)?;
         let scale = Some(DepthScale::kitti());

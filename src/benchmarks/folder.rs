@@ -83,6 +83,10 @@ impl Dataset for FolderDataset {
         self.entries.get(index).map(|e| e.name.clone()).unwrap_or_default()
     }
 
+    fn has_measurements(&self, index: usize) -> bool {
+        self.entries.get(index).is_some_and(|e| e.sparse.is_some())
+    }
+
     fn load(&self, index: usize) -> Result<Sample> {
         let entry = entry(&self.entries, index)?;
         let rgb = picture(&entry.rgb)?;

@@ -73,6 +73,10 @@ impl Dataset for IbimsDataset {
         self.entries.get(index).map(|e| e.0.clone()).unwrap_or_default()
     }
 
+    fn has_measurements(&self, _: usize) -> bool {
+        false
+    }
+
     fn load(&self, index: usize) -> Result<Sample> {
         let (name, path) = entry(&self.entries, index)?;
         let data = Record::read(path, "data")?;

@@ -62,6 +62,10 @@ impl Dataset for KittiDataset {
         self.entries.get(index).map(|e| e.name.clone()).unwrap_or_default()
     }
 
+    fn has_measurements(&self, index: usize) -> bool {
+        index < self.entries.len()
+    }
+
     fn load(&self, index: usize) -> Result<Sample> {
         let Entry { name, rgb, gt, sparse } = entry(&self.entries, index)?;
         let scale = Some(DepthScale::kitti());

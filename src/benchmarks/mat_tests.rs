@@ -119,6 +119,14 @@ fn other_files_are_named() {
     says(&file(&[element(MATRIX, &head(6, &[1, 1], "data"))]), "instead of one struct");
     says(&file(&[compressed(b"no elements")]), "element");
     says(&file(&[element(COMPRESSED, b"no zlib data")]), "damaged");
+    says(&file(&[element(COMPRESSED, b"")]), "damaged");
+    // The element is whole, the stream in it is not.
+    let packed = compressed(&example());
+    for length in (8..packed.len() - 1).step_by(5) {
+        let mut cut = packed[..length].to_vec();
+        cut[4..8].copy_from_slice(&(length as u32 - 8).to_le_bytes());
+        says(&file(&[cut]), "damaged");
+    }
 }
 
 #[test]

@@ -55,6 +55,9 @@ pub trait Dataset: Send + Sync {
     /// Name of a frame: unique in the data set, without path separators. Empty beyond the last frame.
     fn name(&self, index: usize) -> String;
 
+    /// Whether a frame comes with [`Sample::sparse`], told without reading it; false beyond the last frame.
+    fn has_measurements(&self, index: usize) -> bool;
+
     /// Reads a frame. The same index always gives the same sample.
     ///
     /// # Errors
@@ -72,7 +75,8 @@ pub struct Sample {
     pub rgb: RgbImage,
     /// Ground-truth Z-depth, metres, row-major, as many values as `rgb` has pixels; NaN where unknown.
     pub gt: Vec<f32>,
-    /// Measurements of a real sensor, where the data set has them, after its outlier rule.
+    /// The measurements of a sensor, or the points that the benchmark's authors published, where the data set has them; after
+    /// its outlier rule.
     pub sparse: Option<SparseDepth>,
     /// Regions that the data set marks; empty for most.
     pub masks: Vec<Mask>,
@@ -145,7 +149,8 @@ pub struct LayoutOptions {
     /// Seed of measurements that a loader draws itself, as [`frame_seed`] uses it.
     pub seed: u64,
     /// Nearest and farthest ground truth that counts, metres; what lies outside becomes NaN. `None`: all of it, as
-    /// Marigold-DC scores. Measurements are never touched.
+    /// Marigold-DC scores. Measurements that the data set brings are never touched; points drawn from the ground truth lie in the
+    /// range as it does.
     pub range: Option<(f32, f32)>,
 }
 
@@ -261,6 +266,10 @@ impl Dataset for Ranged {
 
     fn name(&self, index: usize) -> String {
         self.frames.name(index)
+    }
+
+    fn has_measurements(&self, index: usize) -> bool {
+        self.frames.has_measurements(index)
     }
 
     fn load(&self, index: usize) -> Result<Sample> {

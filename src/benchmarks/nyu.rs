@@ -105,6 +105,10 @@ impl Dataset for NyuDataset {
         }
     }
 
+    fn has_measurements(&self, index: usize) -> bool {
+        matches!(&self.source, Source::Bundle { hints: Some(_), frames, .. } if index < *frames)
+    }
+
     fn load(&self, index: usize) -> Result<Sample> {
         let (rgb, gt, sparse) = match &self.source {
             Source::Frames(files) => {

@@ -64,6 +64,10 @@ impl Dataset for ScanNetDataset {
         self.entries.get(index).map(|e| e.name.clone()).unwrap_or_default()
     }
 
+    fn has_measurements(&self, _: usize) -> bool {
+        false
+    }
+
     fn load(&self, index: usize) -> Result<Sample> {
         let Entry { name, rgb: rgb_path, gt } = entry(&self.entries, index)?;
         let depth = SparseDepth::read(gt, Some(DepthScale::millimetres())).map_err(|e| naming(gt, e))?;

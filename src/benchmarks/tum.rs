@@ -10,6 +10,9 @@ use crate::error::{Error, Result};
 /// Largest difference between the times of a picture and its depth, seconds: the default of the benchmark's `associate.py`.
 const LARGEST_GAP: f64 = 0.02;
 
+/// Candidates per picture in the mean, beyond which the times cannot be a camera's: 64 in 0.04 s are 1600 frames per second.
+const MOST_CANDIDATES: usize = 64;
+
 #[derive(Clone, Debug)]
 struct Entry {
     name: String,
@@ -39,7 +42,11 @@ impl TumDataset {
         for (recording, dir) in recordings(dir.as_ref(), ["rgb.txt", "depth.txt"])? {
             let (pictures, depths) = (stamped(&dir, "rgb.txt")?, stamped(&dir, "depth.txt")?);
             let times = |files: &[(f64, PathBuf)]| files.iter().map(|f| f.0).collect::<Vec<_>>();
-            let pairs = associate(&times(&pictures), &times(&depths));
+            let pairs = associate(&times(&pictures), &times(&depths)).ok_or_else(|| {
+                let found =
+                    format!("more than {MOST_CANDIDATES} times within {LARGEST_GAP} s of each in rgb.txt");
+                Error::format(dir.join("depth.txt"), found, "times of single frames, in seconds")
+            })?;
             if pairs.is_empty() {
                 let expected = format!("a time within {LARGEST_GAP} s of one in rgb.txt");
                 return Err(Error::format(dir.join("depth.txt"), "no such time", expected));
@@ -71,7 +78,8 @@ fn stamped(dir: &Path, name: &str) -> Result<Vec<(f64, PathBuf)>> {
 }
 
 /// Pairs of indices into two sorted lists of times: the closest pair first, each index once, in order of the first list.
-fn associate(a: &[f64], b: &[f64]) -> Vec<(usize, usize)> {
+/// `None` where so many times are equal or nearly so that the candidates would fill the memory.
+fn associate(a: &[f64], b: &[f64]) -> Option<Vec<(usize, usize)>> {
     let mut near = Vec::new();
     let mut from = 0;
     for (i, &time) in a.iter().enumerate() {
@@ -80,6 +88,9 @@ fn associate(a: &[f64], b: &[f64]) -> Vec<(usize, usize)> {
         }
         let within = b[from..].iter().enumerate().take_while(|(_, t)| **t < time + LARGEST_GAP);
         near.extend(within.map(|(j, t)| ((t - time).abs(), i, from + j)));
+        if near.len() > MOST_CANDIDATES * (a.len() + b.len()) {
+            return None;
+        }
     }
     near.sort_by(|x, y| x.0.total_cmp(&y.0).then((x.1, x.2).cmp(&(y.1, y.2))));
     let (mut used_a, mut used_b) = (vec![false; a.len()], vec![false; b.len()]);
@@ -91,7 +102,7 @@ fn associate(a: &[f64], b: &[f64]) -> Vec<(usize, usize)> {
         }
     }
     pairs.sort_unstable();
-    pairs
+    Some(pairs)
 }
 
 impl Dataset for TumDataset {
@@ -101,6 +112,10 @@ impl Dataset for TumDataset {
 
     fn name(&self, index: usize) -> String {
         self.entries.get(index).map(|e| e.name.clone()).unwrap_or_default()
+    }
+
+    fn has_measurements(&self, _: usize) -> bool {
+        false
     }
 
     fn load(&self, index: usize) -> Result<Sample> {
@@ -118,10 +133,17 @@ mod tests {
     #[test]
     fn the_closest_pairs_are_joined_first() {
         // 1.000 would take 1.012, but 1.010 is closer to it; 1.000 then takes 0.985.
-        assert_eq!(associate(&[1.0, 1.01], &[0.985, 1.012]), [(0, 0), (1, 1)]);
-        assert_eq!(associate(&[1.0, 2.0], &[1.03, 1.97]), []);
-        assert_eq!(associate(&[1.0, 1.001], &[1.0]), [(0, 0)]);
-        assert_eq!(associate(&[], &[1.0]), []);
+        assert_eq!(associate(&[1.0, 1.01], &[0.985, 1.012]).unwrap(), [(0, 0), (1, 1)]);
+        assert_eq!(associate(&[1.0, 2.0], &[1.03, 1.97]).unwrap(), []);
+        assert_eq!(associate(&[1.0, 1.001], &[1.0]).unwrap(), [(0, 0)]);
+        assert_eq!(associate(&[], &[1.0]).unwrap(), []);
+    }
+
+    #[test]
+    fn equal_times_without_end_are_refused() {
+        // 10^10 pairs, were they all listed.
+        assert!(associate(&[1.0; 100_000], &[1.0; 100_000]).is_none());
+        assert_eq!(associate(&[1.0; 3], &[1.0; 2]).unwrap(), [(0, 0), (1, 1)]);
     }
 
     #[test]
@@ -141,6 +163,6 @@ mod tests {
             }
         }
         expected.sort_unstable();
-        assert_eq!(associate(&a, &b), expected);
+        assert_eq!(associate(&a, &b).unwrap(), expected);
     }
 }

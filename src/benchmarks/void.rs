@@ -94,6 +94,10 @@ impl Dataset for VoidDataset {
         self.entries.get(index).map(|e| e.name.clone()).unwrap_or_default()
     }
 
+    fn has_measurements(&self, index: usize) -> bool {
+        index < self.entries.len()
+    }
+
     fn load(&self, index: usize) -> Result<Sample> {
         let Entry { name, rgb, sparse, validity, gt } = entry(&self.entries, index)?;
         let scale = Some(DepthScale::kitti());

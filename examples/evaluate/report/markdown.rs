@@ -1,5 +1,7 @@
 //! The tables as Markdown.
 
+use crate::Score;
+
 use super::{MethodTable, Table, Tables};
 use sdim::depth::metrics::{Interval, METRICS, Metric};
 use std::fmt::Write;
@@ -9,10 +11,22 @@ const MAIN: [&str; 4] = ["mae", "rmse", "abs_rel", "delta_1.25"];
 
 pub fn markdown(report: &Tables) -> String {
     let s = &report.settings;
+    let drawn = match s.points[..] {
+        [0] => "the data set's own measurements".to_string(),
+        _ if s.resample => {
+            format!("measurements drawn in pattern {}, the data set's own left aside", s.pattern)
+        }
+        _ => format!("measurements drawn in pattern {} where a frame has none of its own", s.pattern),
+    };
+    let counted = match s.score {
+        Score::Unseen => "pixels with ground truth that were not measured (`--score unseen`)",
+        Score::All => "all pixels with ground truth, measured ones included (`--score all`)",
+    };
     let mut text = format!(
-        "# Evaluation\n\n{} frames of layout {}, pattern {} where sampled, seed {}, plan {}. Means over frames, in brackets 95 % \
-         bootstrap intervals over frames; errors over pixels with ground truth that were not measured.\n",
-        s.frames, s.layout, s.pattern, s.seed, s.plan
+        "# Evaluation\n\n{} frames of layout {}, {drawn}, seed {}, plan {}. Means over frames, in brackets 95 % bootstrap \
+         intervals over frames; errors over {counted}. Always over all pixels: GE. Never over measured ones: errors by region, and \
+         confidence.\n",
+        s.frames, s.layout, s.seed, s.plan
     );
     report.tables.iter().for_each(|t| table(&mut text, t));
     text
@@ -20,7 +34,7 @@ pub fn markdown(report: &Tables) -> String {
 
 fn table(text: &mut String, t: &Table) {
     let title = match t.own {
-        own if own > 0 && own == t.frames => "The data set's own measurements".to_string(),
+        own if t.points == 0 || own > 0 && own == t.frames => "The data set's own measurements".to_string(),
         0 => format!("{} points", t.points),
         own => format!("{} points ({own} of {} frames: their own measurements)", t.points, t.frames),
     };
@@ -42,7 +56,7 @@ fn table(text: &mut String, t: &Table) {
     let gradient = plain("GE m", t, false, |m| m.gradient_error.map(|g| g.value));
     rows(text, t, others.iter().map(|m| metric(t, m, false)).chain([gradient]).collect());
     let regions = t.methods.first().map_or(&[][..], |m| &m.regions);
-    let by_region = regions.iter().filter(|r| r.frames > 0).map(|r| {
+    let by_region = regions.iter().map(|r| {
         plain(&format!("MAE {}", r.name), t, false, |m| {
             m.regions.iter().find(|found| found.name == r.name).map(|found| found.mae)
         })

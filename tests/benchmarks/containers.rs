@@ -3,32 +3,15 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use sdim::benchmarks::{Dataset, Layout, LayoutOptions, Sample};
+use sdim::Error;
+use sdim::benchmarks::Layout;
 use sdim::scenes::SparsePattern;
-use sdim::{Error, Result};
 use serde_json::Value;
+
+use crate::{all, open, says};
 
 fn fixture(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/benchmarks").join(name)
-}
-
-fn open(layout: Layout, dir: &Path) -> Result<Box<dyn Dataset>> {
-    layout.open(dir, &LayoutOptions::default())
-}
-
-fn all(layout: Layout, dir: &Path) -> Result<Vec<Sample>> {
-    let set = open(layout, dir)?;
-    (0..set.len()).map(|i| set.load(i)).collect()
-}
-
-#[track_caller]
-fn says(layout: Layout, dir: &Path, needles: &[&str]) {
-    let error = all(layout, dir).map(|s| s.len()).unwrap_err();
-    assert!(matches!(error, Error::Format { .. } | Error::Io { .. }), "{error:?}");
-    let error = error.to_string();
-    for needle in needles {
-        assert!(error.contains(needle), "{needle}: {error}");
-    }
 }
 
 fn copy(from: &str, to: &Path) -> Vec<u8> {
@@ -148,6 +131,30 @@ fn damaged_hdf5_files_never_panic() {
             }
         }
         fs::write(&path, whole).unwrap();
+    }
+}
+
+#[test]
+fn huge_numbers_in_hdf5_files_set_nothing_aside() {
+    let dir = tempfile::tempdir().unwrap();
+    let images = copy("nyu_bundle/nyu_img_gt.h5", &dir.path().join("nyu_img_gt.h5"));
+    let hints = copy("nyu_bundle/nyu_pred_with_500.h5", &dir.path().join("nyu_pred_with_500.h5"));
+    for (start, name, whole) in [(0, "nyu_img_gt.h5", images), (8, "nyu_pred_with_500.h5", hints)] {
+        // Addresses, lengths and sizes are 64-bit numbers, most of them aligned; a part of them, for time's sake.
+        for (at, huge) in
+            (start..4096).step_by(24).zip([u64::MAX, i64::MAX as u64, 1 << 40].into_iter().cycle())
+        {
+            let mut damaged = whole.clone();
+            damaged[at..at + 8].copy_from_slice(&huge.to_le_bytes());
+            fs::write(dir.path().join(name), damaged).unwrap();
+            if let Err(error) = open(Layout::Nyu, dir.path()).and_then(|set| set.load(1)) {
+                assert!(matches!(error, Error::Format { .. } | Error::Io { .. }), "{at}: {error:?}");
+            }
+        }
+        fs::write(dir.path().join(name), whole).unwrap();
+    }
+    if let Some(peak) = sdim::system::peak_rss_bytes() {
+        assert!(peak < 1 << 30, "{peak} bytes");
     }
 }
 

@@ -1,0 +1,90 @@
+//! What holds for all layouts, and plain folders.
+
+use std::fs;
+
+use sdim::benchmarks::{Layout, LayoutOptions, frame_seed};
+use sdim::depth::npy;
+use sdim::scenes::SparsePattern;
+use sdim::{DepthScale, Error};
+
+use crate::copies::{H, W, kitti, picture};
+use crate::{all, points, says};
+
+#[test]
+fn layouts_have_names_and_protocols() {
+    for layout in Layout::ALL {
+        assert_eq!(layout.to_string().parse::<Layout>().unwrap(), layout);
+    }
+    let error = "NYU".parse::<Layout>().unwrap_err().to_string();
+    assert!(error.contains("NYU") && error.contains("folder, nyu, void, ibims, kitti"), "{error}");
+    assert_eq!(
+        (Layout::Nyu.points(), Layout::Ibims.points(), Layout::Kitti.points()),
+        (Some(500), Some(1000), None)
+    );
+    assert_eq!((Layout::Void.frames(), Layout::Tum.frames()), (Some(800), None));
+}
+
+#[test]
+fn options_that_do_not_fit_are_refused() {
+    let dir = kitti();
+    let mut options = LayoutOptions { scale: Some(DepthScale::millimetres()), ..Default::default() };
+    let error = Layout::Kitti.open(dir.path(), &options).map(|_| ()).unwrap_err().to_string();
+    assert!(error.contains("depth scale") && error.contains("kitti"), "{error}");
+    options.scale = None;
+    options.range = Some((5.0, 0.2));
+    assert!(matches!(Layout::Kitti.open(dir.path(), &options), Err(Error::Argument { name: "range", .. })));
+    options.range = Some((2.0, f32::NAN));
+    assert!(Layout::Kitti.open(dir.path(), &options).is_err());
+}
+
+#[test]
+fn a_range_takes_away_ground_truth_and_nothing_else() {
+    let dir = kitti();
+    let options = LayoutOptions { range: Some((4.5, 5.5)), ..Default::default() };
+    let whole = all(Layout::Kitti, dir.path()).unwrap().remove(0);
+    let set = Layout::Kitti.open(dir.path(), &options).unwrap();
+    let part = set.load(0).unwrap();
+    assert_eq!((set.len(), set.name(1)), (2, whole.name.replace("0000000005", "0000000013")));
+    assert_eq!(points(&part), points(&whole));
+    for (a, b) in part.gt.iter().zip(&whole.gt) {
+        assert!(if (4.5..=5.5).contains(b) { a == b } else { a.is_nan() });
+    }
+    assert!(part.gt.iter().any(|d| d.is_nan()) && part.gt.iter().any(|d| !d.is_nan()));
+}
+
+#[test]
+fn marigolds_folders() {
+    let dir = tempfile::tempdir().unwrap();
+    let at = |name: &str| dir.path().join(name);
+    picture(at("rgb/0000.png"), 7);
+    fs::create_dir_all(at("gt")).unwrap();
+    fs::create_dir_all(at("sparse")).unwrap();
+    fs::create_dir_all(at("intrinsics")).unwrap();
+    fs::write(at("intrinsics/0000.txt"), "1 0 0").unwrap();
+    // NumPy's default type is f64, and a depth of 0 means none.
+    let header = format!("{{'descr': '<f8', 'fortran_order': False, 'shape': ({H}, {W}), }}\n");
+    let mut file = b"\x93NUMPY\x01\x00".to_vec();
+    file.extend((header.len() as u16).to_le_bytes());
+    file.extend(header.as_bytes());
+    file.extend((0..W * H).flat_map(|i| (if i == 3 { 0.0 } else { i as f64 * 0.25 + 1.0 }).to_le_bytes()));
+    fs::write(at("gt/0000.npy"), &file).unwrap();
+    let mut sparse = [0.0; W * H];
+    sparse[W + 2] = 1.75;
+    npy::write_npy(at("sparse/0000.npy"), W, H, &sparse).unwrap();
+    let sample = all(Layout::Folder, dir.path()).unwrap().remove(0);
+    assert_eq!((sample.name.as_str(), sample.gt[2], sample.gt[3].is_nan()), ("0000", 1.5, true));
+    assert_eq!(points(&sample), [(2, 1, 1.75)]);
+    assert_eq!(sample.measurements(9, SparsePattern::Uniform, 1).unwrap().measured(), 1);
+
+    npy::write_npy(at("sparse/0000.npy"), W, H, &[0.0; W * H]).unwrap();
+    says(Layout::Folder, dir.path(), &["sparse", "0000.npy", "no valid depth"]);
+    npy::write_npy(at("sparse/0000.npy"), W, H, &[2.0e4; W * H]).unwrap();
+    says(Layout::Folder, dir.path(), &["0000.npy", "20000"]);
+    fs::remove_file(at("sparse/0000.npy")).unwrap();
+    let sample = all(Layout::Folder, dir.path()).unwrap().remove(0);
+    let drawn =
+        |seed| sample.measurements(40, SparsePattern::Uniform, seed).unwrap().points().collect::<Vec<_>>();
+    assert_eq!(drawn(frame_seed(5, 0)), drawn(5));
+    assert_ne!(drawn(5), drawn(frame_seed(5, 1)));
+    assert_eq!(drawn(5).len(), 40);
+}
