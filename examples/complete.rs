@@ -38,9 +38,9 @@ struct Args {
     /// Adapter directory on top of --model.
     #[arg(long)]
     adapter: Option<PathBuf>,
-    /// How matrices are held: f32, bf16 or int8.
-    #[arg(long, default_value = "f32")]
-    weights: WeightFormat,
+    /// How matrices are held: f32, bf16 or int8; without it, what this machine multiplies best.
+    #[arg(long)]
+    weights: Option<WeightFormat>,
     /// Pixels to ask: every, stride:N or budget:N.
     #[arg(long, default_value_t = Default::default())]
     plan: QueryPlan,
@@ -98,11 +98,11 @@ fn main() -> anyhow::Result<()> {
     sdim::kernels::keep_freed_memory();
     let inputs = args.inputs();
     let start = Instant::now();
+    let device = device(&args.device)?;
     let options = LoadOptions {
-        device: device(&args.device)?,
-        weights: args.weights,
+        weights: args.weights.unwrap_or(WeightFormat::native(&device)),
         adapter: args.adapter.clone(),
-        ..LoadOptions::default()
+        ..LoadOptions::on(&device)
     };
     let completer = load_as(&args.model, &options)?;
     let rgb = read_rgb(&inputs.rgb)?;

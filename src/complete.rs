@@ -151,7 +151,7 @@ impl DepthCompleter {
     /// [`Error::Tensors`] if the device refuses the tensors.
     #[cfg(feature = "tiny")]
     pub fn tiny_on(device: &Device) -> Result<Self> {
-        Self::tiny_with(&LoadOptions { device: device.clone(), ..LoadOptions::default() })
+        Self::tiny_with(&LoadOptions::on(device))
     }
 
     /// As [`DepthCompleter::tiny`], with a form of weights and an adapter.

@@ -151,24 +151,22 @@ pub struct LoadOptions {
     pub lora: LoraMode,
 }
 
-impl std::str::FromStr for WeightFormat {
-    type Err = Error;
-
-    /// `f32`, `bf16` or `int8`.
-    fn from_str(text: &str) -> Result<Self> {
-        match text {
-            "f32" => Ok(Self::F32),
-            "bf16" => Ok(Self::Bf16),
-            "int8" => Ok(Self::Int8),
-            other => Err(Error::argument("weight format", other, "f32, bf16 or int8")),
+impl LoadOptions {
+    /// A device, the form of weights that suits it ([`WeightFormat::native`]), no adapter.
+    pub fn on(device: &Device) -> Self {
+        Self {
+            device: device.clone(),
+            weights: WeightFormat::native(device),
+            adapter: None,
+            lora: LoraMode::default(),
         }
     }
 }
 
 impl Default for LoadOptions {
-    /// The CPU, f32, no adapter.
+    /// As [`LoadOptions::on`] the CPU.
     fn default() -> Self {
-        Self { device: Device::Cpu, weights: WeightFormat::F32, adapter: None, lora: LoraMode::default() }
+        Self::on(&Device::Cpu)
     }
 }
 
@@ -209,13 +207,13 @@ impl SdimModel {
         Ok(self)
     }
 
-    /// Loads a checkpoint directory in f32: `config.json`, `preprocessor_config.json`, `tokenizer.json`,
+    /// Loads a checkpoint directory in the form that suits the device ([`LoadOptions::on`]): `config.json`, `preprocessor_config.json`, `tokenizer.json`,
     /// `model.safetensors` or its shards with their index, and `sdim.json` and `sdim.safetensors` if it has them.
     ///
     /// # Errors
     /// Typed errors that name the file, key or tensor.
     pub fn load(dir: &Path, device: &Device) -> Result<Self> {
-        Self::load_with(dir, &LoadOptions { device: device.clone(), ..LoadOptions::default() })
+        Self::load_with(dir, &LoadOptions::on(device))
     }
 
     /// As [`SdimModel::load`], with a form of weights and an adapter.

@@ -11,11 +11,7 @@ use std::path::Path;
 pub fn load(model: &str, adapter: Option<&Path>, device_name: &str) -> anyhow::Result<DepthCompleter> {
     load_as(
         model,
-        &LoadOptions {
-            device: device(device_name)?,
-            adapter: adapter.map(Path::to_path_buf),
-            ..LoadOptions::default()
-        },
+        &LoadOptions { adapter: adapter.map(Path::to_path_buf), ..LoadOptions::on(&device(device_name)?) },
     )
 }
 

@@ -123,6 +123,15 @@ pub(super) fn kernels(level: Level, format: WeightFormat) -> (Kernel, Option<Ker
     (Kernel::portable(format), None)
 }
 
+/// Whether a level has instructions that multiply pairs of bf16.
+pub(super) fn multiplies_bf16(level: Level) -> bool {
+    #[cfg(target_arch = "x86_64")]
+    if level.is_amx() {
+        return true;
+    }
+    kernels(level, WeightFormat::Bf16).1.is_some()
+}
+
 impl Kernel {
     pub(super) fn portable(format: WeightFormat) -> Kernel {
         if format == WeightFormat::Int8 { INT8_PORTABLE } else { BF16_PORTABLE }

@@ -13,6 +13,7 @@ mod amx_unit;
 pub(super) mod attend;
 mod dot_bf16;
 mod dot_int8;
+mod format;
 mod gate;
 mod gemm;
 mod isa;
@@ -31,6 +32,7 @@ use crate::error::{Error, Result};
 #[cfg(target_arch = "x86_64")]
 pub(super) use amx_unit::busy as amx_busy;
 use candle_core::{DType, Tensor};
+pub use format::WeightFormat;
 pub use gate::PackedGate;
 use gemm::{Channels, Finish, Job};
 use isa::Kernel;
@@ -39,17 +41,6 @@ use panel::Panels;
 
 #[cfg(target_arch = "x86_64")]
 pub(super) use amx_unit::usable as amx_usable;
-
-/// How the weights of a model are held in memory.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum WeightFormat {
-    /// 32-bit floats, as plain tensors; the one format that can be trained.
-    F32,
-    /// 16-bit floats with the exponent range of f32 (8 bits of precision), as checkpoints are published.
-    Bf16,
-    /// Signed bytes with one scale per output channel.
-    Int8,
-}
 
 /// A weight `[m, k]` (outputs, inputs, as checkpoints store it), packed for the CPU kernels.
 ///
