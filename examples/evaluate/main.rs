@@ -3,8 +3,8 @@
 //! `cargo run --release --example evaluate -- --layout folder --data DIR --points 100,500 --out RESULTS`
 //!
 //! Errors are over ground-truth pixels that were not given as input; the tables of Marigold-DC, and those compared with them, count
-//! all of them: `--score all`. Each frame's scores are one small file under `--out`, so a run
-//! that was stopped goes on where it was, and `--shard I/N` spreads a data set over machines; `--merge` makes one report of them.
+//! all of them: `--score all`. Each frame's scores are one small file under `--out`, so a run that was stopped goes on where it was,
+//! and `--shard I/N` spreads a data set over machines; `--merge` makes one report of them.
 //! report.md, report.json and frames.csv depend on the scores alone and are the same, byte for byte, however the work was divided;
 //! times and memory stand in speed.json and are printed to stderr.
 //!
@@ -16,7 +16,7 @@
 //! SLURM, 16 jobs, and one for the report after they all went well:
 //!
 //! ```sh
-//! run="target/release/examples/evaluate --layout void --data /data/void_1500 --out /results/void_1500"
+//! run="target/release/examples/evaluate --layout void --data /data/void_1500 --score all --out /results/void_1500"
 //! jobs=$(sbatch --parsable --array=0-15 --wrap "$run --shard \$SLURM_ARRAY_TASK_ID/16")
 //! sbatch --dependency=afterok:$jobs --wrap "target/release/examples/evaluate --merge /results/void_1500 --out /results/void_1500"
 //! ```
@@ -25,7 +25,7 @@
 //! that all can write to at `/results`, and as the container's command, in the form that a shell reads for the index:
 //!
 //! ```sh
-//! sh -c 'exec evaluate --layout void --data /data/void_1500 --out /results/void_1500 --shard "$JOB_COMPLETION_INDEX/16"'
+//! sh -c 'exec evaluate --layout void --data /data/void_1500 --score all --out /results/void_1500 --shard "$JOB_COMPLETION_INDEX/16"'
 //! ```
 //!
 //! then `--merge` as above in a Job of its own. It names what is missing when not all shards are done.
@@ -82,8 +82,8 @@ pub struct Args {
     /// Draw points from the ground truth even where a frame has measurements of its own.
     #[arg(long)]
     resample: bool,
-    /// Pixels with ground truth that count: unseen leaves out those given as input, all does not (as Marigold-DC's script, and so
-    /// the tables that are compared with it).
+    /// Pixels with ground truth that count: unseen leaves out those given as input, all does not (as Marigold-DC's
+    /// script/eval.py, and so the tables that are compared with it).
     #[arg(long, value_enum, default_value_t = Score::Unseen)]
     score: Score,
     /// Seed of the drawn points.

@@ -75,7 +75,7 @@ pub(super) fn below(root: &Path, relative: &str, list: &Path) -> Result<PathBuf>
 
 /// The lines of a text file that are neither empty nor comments (`#`), without the space around them.
 pub(super) fn lines(path: &Path) -> Result<Vec<String>> {
-    let text = fs::read(path).map_err(Error::io(path))?;
+    let text = crate::files::read_text(path)?;
     let text = String::from_utf8(text).map_err(|_| Error::format(path, "no UTF-8 text", "a text file"))?;
     let used = text.lines().map(str::trim).filter(|l| !l.is_empty() && !l.starts_with('#'));
     Ok(used.map(str::to_string).collect())
@@ -123,12 +123,17 @@ pub(super) fn picture(path: &Path) -> Result<RgbImage> {
 /// Measured depth of the picture's size; at least one pixel is valid.
 pub(super) fn depth(path: &Path, scale: Option<DepthScale>, rgb: &RgbImage) -> Result<SparseDepth> {
     let map = SparseDepth::read(path, scale).map_err(|e| naming(path, e))?;
-    let (w, h) = (rgb.width() as usize, rgb.height() as usize);
-    if (map.width(), map.height()) != (w, h) {
-        let found = format!("{}x{} pixels", map.width(), map.height());
-        return Err(Error::format(path, found, format!("{w}x{h} as its picture")));
-    }
+    same_size(path, (map.width(), map.height()), rgb)?;
     some_valid(path, map)
+}
+
+/// Fails, naming the file, unless a map of this width and height has the picture's size.
+pub(super) fn same_size(path: &Path, (width, height): (usize, usize), rgb: &RgbImage) -> Result<()> {
+    let (w, h) = (rgb.width() as usize, rgb.height() as usize);
+    if (width, height) == (w, h) {
+        return Ok(());
+    }
+    Err(Error::format(path, format!("{width}x{height} pixels"), format!("{w}x{h} as its picture")))
 }
 
 /// Fails, naming the file, when a map has no valid pixel.

@@ -44,7 +44,7 @@ fn scales(path: &Path) -> Result<HashMap<String, DepthScale>> {
         name: String,
         scale: f32,
     }
-    let text = std::fs::read(path).map_err(Error::io(path))?;
+    let text = crate::files::read_text(path)?;
     let frames: Vec<Frame> = serde_json::from_slice(&text).map_err(|e| {
         Error::format(path, e.to_string(), "a list of objects with `name` and `scale` (units per metre)")
     })?;

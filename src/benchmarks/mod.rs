@@ -75,8 +75,8 @@ pub struct Sample {
     pub rgb: RgbImage,
     /// Ground-truth Z-depth, metres, row-major, as many values as `rgb` has pixels; NaN where unknown.
     pub gt: Vec<f32>,
-    /// The measurements of a sensor, or the points that the benchmark's authors published, where the data set has them; after
-    /// its outlier rule.
+    /// The measurements of a sensor, or the points that the benchmark's authors published, where the data set has them, after
+    /// its outlier rule; for [`DdadDataset`] without hints those that stand in for them.
     pub sparse: Option<SparseDepth>,
     /// Regions that the data set marks; empty for most.
     pub masks: Vec<Mask>,

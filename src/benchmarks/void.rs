@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use image::RgbImage;
 
-use super::files::{below, depth, frame_name, lines, naming, picture, some_valid};
+use super::files::{below, depth, frame_name, lines, naming, picture, same_size, some_valid};
 use super::{Dataset, Sample, entry};
 use crate::depth::{DepthScale, SparseDepth, png16};
 use crate::error::{Error, Result};
@@ -110,14 +110,7 @@ impl Dataset for VoidDataset {
 
 fn valid_only(sparse: &SparseDepth, path: &Path, rgb: &RgbImage) -> Result<SparseDepth> {
     let (w, h, validity) = png16::read_png16(path).map_err(|e| naming(path, e))?;
-    let (width, height) = (rgb.width() as usize, rgb.height() as usize);
-    if (w, h) != (width, height) {
-        return Err(Error::format(
-            path,
-            format!("{w}x{h} pixels"),
-            format!("{width}x{height} as its picture"),
-        ));
-    }
+    same_size(path, (w, h), rgb)?;
     let keep = |(&depth, &valid): (&f32, &u16)| if valid == 0 { f32::NAN } else { depth };
     let kept = sparse.as_slice().iter().zip(&validity).map(keep).collect();
     some_valid(path, SparseDepth::new(w, h, kept)?)

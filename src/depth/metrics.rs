@@ -88,7 +88,8 @@ pub fn errors(predicted: &[f32], truth: &[f32], sparse: &SparseDepth) -> Result<
     compare(predicted, truth, |i| sparse.as_slice()[i].is_nan())
 }
 
-/// As [`errors`], over all pixels with ground truth.
+/// As [`errors`], over all pixels with ground truth, measured or not, as Marigold-DC's `script/eval.py` counts them for its table, with
+/// which the paper's Table 2 compares.
 ///
 /// # Errors
 /// As [`errors`].

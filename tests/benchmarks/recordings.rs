@@ -31,6 +31,10 @@ fn damaged_tum() {
         fs::write(&list, wrong).unwrap();
         says(Layout::Tum, dir.path(), &["depth.txt"]);
     }
+    for empty in ["", "# nothing\n"] {
+        fs::write(&list, empty).unwrap();
+        says(Layout::Tum, dir.path(), &["depth.txt", "no such time"]);
+    }
     fs::write(&list, "300.0 depth/200.0.png").unwrap();
     says(Layout::Tum, dir.path(), &["depth.txt", "0.02"]);
     fs::remove_file(&list).unwrap();
