@@ -1,6 +1,6 @@
 //! SwiGLU and GELU.
 
-use super::exec::{on_cpu, output, read2, read3, same_shape, slice, tensor};
+use super::exec::{on_cpu, output, read2, read3, same_shape, slice, tensor, written};
 use super::level::{Level, per_level};
 use super::math::{erf, madd, sigmoid};
 use crate::error::Result;
@@ -73,10 +73,12 @@ impl CustomOp2 for SwiGlu {
     ) -> candle_core::Result<(CpuStorage, Shape)> {
         let (gate, up) = (slice(s1, l1)?, slice(s2, l2)?);
         let level = Level::current();
-        let mut out = vec![0f32; gate.len()];
-        out.par_chunks_mut(CHUNK)
-            .zip(gate.par_chunks(CHUNK).zip(up.par_chunks(CHUNK)))
-            .for_each(|(o, (g, u))| swiglu_chunk(level, o, g, u));
+        let inputs = gate.par_chunks(CHUNK).zip(up.par_chunks(CHUNK));
+        let products = |out: &mut [f32]| {
+            out.par_chunks_mut(CHUNK).zip(inputs).for_each(|(o, (g, u))| swiglu_chunk(level, o, g, u));
+        };
+        // SAFETY: both inputs have the same length, so that each element gets its product.
+        let out = unsafe { written(gate.len(), products) };
         Ok(output(out, l1.shape().clone()))
     }
 
@@ -133,8 +135,11 @@ impl CustomOp1 for Gelu {
     fn cpu_fwd(&self, s: &CpuStorage, l: &Layout) -> candle_core::Result<(CpuStorage, Shape)> {
         let x = slice(s, l)?;
         let level = Level::current();
-        let mut out = vec![0f32; x.len()];
-        out.par_chunks_mut(CHUNK).zip(x.par_chunks(CHUNK)).for_each(|(o, x)| gelu_chunk(level, o, x));
+        let values = |out: &mut [f32]| {
+            out.par_chunks_mut(CHUNK).zip(x.par_chunks(CHUNK)).for_each(|(o, x)| gelu_chunk(level, o, x));
+        };
+        // SAFETY: each element gets its value.
+        let out = unsafe { written(x.len(), values) };
         Ok(output(out, l.shape().clone()))
     }
 

@@ -5,7 +5,7 @@ use super::attention::AttentionLayout;
 use super::attention_plan::{Own, Plan, SHORT};
 use super::attention_rows::{self, row_dots, row_sums};
 use super::attention_tile::Data;
-use super::exec::{read2, read3, tensor};
+use super::exec::{read2, read3, tensor, written};
 use super::level::Level;
 use super::packed::attend::{Attend, GIVEN, PARTS, PackedKeys, Part, Rows, Space};
 use crate::error::Result;
@@ -79,8 +79,18 @@ struct Call<'a> {
 impl Call<'_> {
     fn run(&self) -> Vec<f32> {
         let width = self.layout.heads * self.layout.head_dim;
+        if self.plan.covers(self.data.q.len() / width) {
+            // SAFETY: the tiles do not overlap, so they are all rows, of which each head's elements are written.
+            return unsafe { written(self.data.q.len(), |out| self.fill(out, width)) };
+        }
         let mut out = vec![0f32; self.data.q.len()];
-        let tiles = self.plan.split(&mut out, width).into_par_iter().enumerate();
+        self.fill(&mut out, width);
+        out
+    }
+
+    /// Writes the tiles' rows.
+    fn fill(&self, out: &mut [f32], width: usize) {
+        let tiles = self.plan.split(out, width).into_par_iter().enumerate();
         tiles.for_each_init(Scratch::default, |scratch, (tile, out)| {
             let rows = self.plan.tiles[tile].rows.len() * self.group();
             // Even steps, so that none is too low to keep the multipliers busy.
@@ -92,7 +102,6 @@ impl Call<'_> {
                 }
             }
         });
-        out
     }
 
     fn group(&self) -> usize {

@@ -89,6 +89,11 @@ impl Plan {
         }
     }
 
+    /// Whether each of `rows` query rows is in a tile.
+    pub(super) fn covers(&self, rows: usize) -> bool {
+        self.tiles.iter().map(|tile| tile.rows.len()).sum::<usize>() == rows
+    }
+
     /// Splits a buffer of query rows of `width` into the tiles' rows.
     pub(super) fn split<'b>(&self, mut data: &'b mut [f32], width: usize) -> Vec<&'b mut [f32]> {
         let (mut parts, mut at) = (Vec::with_capacity(self.tiles.len()), 0);

@@ -1,6 +1,8 @@
 //! RMS normalisation.
 
-use super::exec::{chunk_rows, dims2, expect_dims, on_cpu, output, read3, slice, sum_in_order, tensor};
+use super::exec::{
+    chunk_rows, dims2, expect_dims, on_cpu, output, read3, slice, sum_in_order, tensor, written,
+};
 use super::level::{Level, per_level};
 use crate::error::Result;
 use candle_core::{CpuStorage, CustomOp2, D, Layout, Shape, Tensor};
@@ -95,13 +97,14 @@ impl CustomOp2 for RmsNorm {
     ) -> candle_core::Result<(CpuStorage, Shape)> {
         let (x, weight) = (slice(s1, l1)?, slice(s2, l2)?);
         let level = Level::current();
-        let mut out = vec![0f32; x.len()];
-        if !x.is_empty() {
-            let chunk = chunk_rows(weight.len(), CHUNK) * weight.len();
+        let chunk = (chunk_rows(weight.len(), CHUNK) * weight.len()).max(1);
+        let rows = |out: &mut [f32]| {
             out.par_chunks_mut(chunk)
                 .zip(x.par_chunks(chunk))
                 .for_each(|(o, x)| forward_chunk(level, o, x, weight, self.eps));
-        }
+        };
+        // SAFETY: `x` is whole rows of the weight's width, and each element of a row is written.
+        let out = unsafe { written(x.len(), rows) };
         Ok(output(out, l1.shape().clone()))
     }
 

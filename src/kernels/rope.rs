@@ -1,6 +1,6 @@
 //! Rotary position embedding.
 
-use super::exec::{chunk_rows, dims2, expect_dims, on_cpu, output, read2, slice};
+use super::exec::{chunk_rows, dims2, expect_dims, on_cpu, output, read2, slice, written};
 use super::level::{Level, per_level};
 use super::math::madd;
 use crate::error::{Error, Result};
@@ -83,18 +83,22 @@ impl CustomOp1 for Rope {
         let level = Level::current();
         let (n, half) = self.cos.dims2()?;
         let width = 2 * half * self.heads;
-        let mut out = vec![0f32; x.len()];
-        if n * half > 0 {
-            let rows = chunk_rows(width, CHUNK);
-            let sign = if self.back { -1.0 } else { 1.0 };
-            read2(&self.cos, &self.sin, |cos, sin| {
-                let angles = cos.par_chunks(rows * half).zip(sin.par_chunks(rows * half));
-                out.par_chunks_mut(rows * width).zip(x.par_chunks(rows * width).zip(angles)).for_each(
-                    |(o, (x, (cos, sin)))| rope_chunk(level, o, x, cos, sin, half, self.heads, sign),
-                );
-                Ok(())
-            })?;
+        if n * half == 0 {
+            return Ok(output(Vec::new(), l.shape().clone()));
         }
+        let rows = chunk_rows(width, CHUNK);
+        let sign = if self.back { -1.0 } else { 1.0 };
+        let out = read2(&self.cos, &self.sin, |cos, sin| {
+            let angles = cos.par_chunks(rows * half).zip(sin.par_chunks(rows * half));
+            let inputs = x.par_chunks(rows * width).zip(angles);
+            let turned = |out: &mut [f32]| {
+                out.par_chunks_mut(rows * width).zip(inputs).for_each(|(o, (x, (cos, sin)))| {
+                    rope_chunk(level, o, x, cos, sin, half, self.heads, sign);
+                });
+            };
+            // SAFETY: there are as many angles as rows of `x`; of each row both halves of each head are written.
+            Ok(unsafe { written(x.len(), turned) })
+        })?;
         Ok(output(out, l.shape().clone()))
     }
 

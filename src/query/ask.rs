@@ -9,18 +9,21 @@ use super::prefix::Prefix;
 use super::prompt::{Glimpse, Query, Tokens};
 use super::settings::PixelReference;
 use crate::error::{Error, Result};
+use crate::kernels;
 use crate::model::SdimModel;
 use crate::vlm::cache::KvCache;
 use crate::vlm::decoder::{Context, Keep};
 use crate::vlm::rope::Position;
-use candle_core::Tensor;
+use candle_core::{Device, Tensor};
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 
 /// Rows of one decoder pass, at most: large enough for efficient products, small enough for the caches.
-const ROWS: usize = 4096;
+const ROWS: usize = 2048;
+/// Rows whose logits are made and read at a time: what stays in the caches.
+const LOGITS: usize = 256;
 /// Queries whose prompts are written at a time, so that memory does not grow with their number.
-const CHUNK: usize = 4 * ROWS;
+const CHUNK: usize = 8 * ROWS;
 
 /// Asks all queries in the checkpoint's own answer mode and returns one reading each, in metres, in their order.
 ///
@@ -224,10 +227,25 @@ impl<'a> Batch<'a> {
         Ok(())
     }
 
-    /// The number rows of the output head, `[items, numbers]`.
-    fn number_logits(&self) -> Result<Vec<f32>> {
-        let logits = self.model.number_rows.linear(&self.last, None)?;
-        Ok(logits.flatten_all()?.to_vec1()?)
+    /// What `read` makes of each item's logits of the numbers.
+    fn of_numbers<S: Send, T: Send>(
+        &self,
+        scratch: impl Fn() -> S + Sync,
+        read: impl Fn(&mut S, &[f32]) -> T + Sync,
+    ) -> Result<Vec<T>> {
+        let mut out = Vec::with_capacity(self.items());
+        for first in (0..self.items()).step_by(LOGITS) {
+            let some = self.last.narrow(0, first, LOGITS.min(self.items() - first))?;
+            let logits = self.model.number_rows.linear(&some, None)?;
+            let width = logits.dim(1)?.max(1);
+            kernels::read(&logits.to_device(&Device::Cpu)?, |logits| {
+                out.par_extend(
+                    logits.par_chunks(width).map_init(&scratch, |scratch, row| read(scratch, row)),
+                );
+                Ok(())
+            })?;
+        }
+        Ok(out)
     }
 }
 
@@ -235,20 +253,18 @@ impl<'a> Batch<'a> {
 fn forced_numbers(batch: &mut Batch) -> Result<Vec<Reading>> {
     let numbers = batch.model.prompts.numbers();
     let (decimals, integers) = match numbers.format {
-        NumberFormat::Bins { range, bins } => {
-            let rows = batch.number_logits()?;
-            let rows = rows.par_chunks(bins);
-            return Ok(rows.map_init(Vec::new, |scratch, row| read_bins_with(row, range, scratch)).collect());
+        NumberFormat::Bins { range, .. } => {
+            return batch.of_numbers(Vec::new, |scratch, row| read_bins_with(row, range, scratch));
         }
         NumberFormat::Digits { decimals, integers } => (decimals, integers),
     };
     let mut readers = vec![DigitReader::new(decimals, integers); batch.items()];
     let mut alive = vec![true; batch.items()];
     loop {
-        let rows = batch.number_logits()?;
+        let rows = batch.of_numbers(|| (), |(), row| row.to_vec())?;
         let mut ids = vec![numbers.ids[0]; batch.items()];
         let mut open = false;
-        for (i, row) in rows.chunks(numbers.ids.len()).enumerate() {
+        for (i, row) in rows.iter().enumerate() {
             if alive[i] {
                 match readers[i].push(row) {
                     Some(digit) => ids[i] = numbers.ids[digit],

@@ -37,7 +37,11 @@ macro_rules! kernel {
         pub(super) const $constant: Kernel = {
             $(#[target_feature(enable = $features)])?
             unsafe fn convert(words: &mut [u32], x: &[f32]) -> f32 {
-                $convert(words, x)
+                // SAFETY: the caller's promise, where this needs one.
+                #[allow(unused_unsafe)]
+                unsafe {
+                    $convert(words, x)
+                }
             }
             $(#[target_feature(enable = $features)])?
             unsafe fn multiply(job: &Job<'_>, target: Target, rows: Range<usize>, panels: Range<usize>) {
@@ -89,7 +93,7 @@ mod x86 {
         BF16_DOT = "avx512-bf16",
         2,
         1,
-        lhs::pairs,
+        lhs::pairs_at_once,
         Bf16,
         "avx512bf16,avx512f,avx512vl,avx512dq,avx512bw,avx2,fma"
     );

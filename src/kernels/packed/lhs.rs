@@ -65,6 +65,28 @@ pub(super) fn pairs(words: &mut [u32], x: &[f32]) -> f32 {
     1.0
 }
 
+/// [`pairs`] by AVX512-BF16, to which subnormal values are zeros.
+///
+/// # Safety
+/// The CPU must have AVX512-BF16.
+#[cfg(target_arch = "x86_64")]
+#[inline(always)]
+pub(super) unsafe fn pairs_at_once(words: &mut [u32], x: &[f32]) -> f32 {
+    use std::arch::x86_64::{__m512, __m512bh, _mm512_cvtne2ps_pbh, _mm512_loadu_ps, _mm512_storeu_ps};
+    let (whole, rest) = x.as_chunks::<32>();
+    let (first, last) = words.split_at_mut(whole.len() * 16);
+    for (words, x) in first.as_chunks_mut::<16>().0.iter_mut().zip(whole) {
+        // SAFETY: the caller's promise for the CPU; 32 values become 16 words.
+        unsafe {
+            let (low, high) = (_mm512_loadu_ps(x.as_ptr()), _mm512_loadu_ps(x.as_ptr().add(16)));
+            let pairs = std::mem::transmute::<__m512bh, __m512>(_mm512_cvtne2ps_pbh(high, low));
+            _mm512_storeu_ps(words.as_mut_ptr().cast(), pairs);
+        }
+    }
+    from_f32(rest, last);
+    1.0
+}
+
 /// Rounded to bf16, but as f32: two words to a step.
 #[inline(always)]
 pub(super) fn widened(words: &mut [u32], x: &[f32]) -> f32 {
