@@ -80,6 +80,12 @@ pub(super) unsafe fn written(len: usize, fill: impl FnOnce(&mut [f32])) -> Vec<f
     data
 }
 
+/// Runs `f` on a thread of the pool. From any other, each parallel operation inside `f` would put its thread to sleep and
+/// wake it again, which costs more than a small operation.
+pub(crate) fn in_pool<R: Send>(f: impl FnOnce() -> R + Send) -> R {
+    rayon::scope(|_| f())
+}
+
 /// Rows in a chunk of work, so that a chunk holds about `elements` elements. Depends on the shape
 /// only, never on the number of threads.
 pub(super) fn chunk_rows(width: usize, elements: usize) -> usize {

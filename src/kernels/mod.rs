@@ -47,7 +47,7 @@ pub use add::add;
 pub use attention::{AttentionLayout, Block, Precision, attention};
 pub use bins::{BinStats, bin_stats};
 pub use conv::conv3x3;
-pub(crate) use exec::read;
+pub(crate) use exec::{in_pool, read};
 pub use linear::linear;
 pub use memory::keep_freed_memory;
 pub use norm::rms_norm;

@@ -102,14 +102,14 @@ struct Plan {
 }
 
 /// Cuts the queries into batches of equally long suffixes, and puts what `answer` makes of them into their order.
-fn in_batches<T: Clone>(
+fn in_batches<T: Clone + Send>(
     model: &SdimModel,
     prefix: &Prefix,
     queries: &[Query],
     plan: Plan,
     progress: &mut dyn FnMut(usize) -> bool,
     blank: T,
-    answer: &mut dyn FnMut(Batch) -> Result<Vec<T>>,
+    answer: &mut (dyn FnMut(Batch) -> Result<Vec<T>> + Send),
 ) -> Result<Vec<T>> {
     let by_marker = matches!(model.prompts.settings().pixel_reference, PixelReference::Marker(_));
     if by_marker != prefix.marked.is_some() {
@@ -135,7 +135,7 @@ fn in_batches<T: Clone>(
             for batch in members.chunks((ROWS / rows.max(1)).max(1)) {
                 let asked: Vec<&Query> = batch.iter().map(|&i| &chunk[i]).collect();
                 let tokens: Vec<&Tokens> = batch.iter().map(|&i| &suffixes[i]).collect();
-                let answers = answer(Batch::open(model, prefix, &asked, &tokens)?)?;
+                let answers = kernels::in_pool(|| answer(Batch::open(model, prefix, &asked, &tokens)?))?;
                 for (&i, a) in batch.iter().zip(answers) {
                     out[start + i] = a;
                 }

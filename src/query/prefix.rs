@@ -5,6 +5,7 @@ use super::prompt::FrameSpace;
 use super::settings::PixelReference;
 use crate::depth::SparseDepth;
 use crate::error::Result;
+use crate::kernels;
 use crate::model::SdimModel;
 use crate::vlm::cache::KvCache;
 use crate::vlm::decoder::Keep;
@@ -47,7 +48,7 @@ impl SdimModel {
                 let frame = MarkedFrame::new(self, marker, rgb, pixels, scattered)?;
                 Ok(Encoded::PerQuery(Box::new(frame)))
             }
-            _ => Ok(Encoded::Once(self.encode(pixels, scattered)?)),
+            _ => Ok(Encoded::Once(kernels::in_pool(|| self.encode(pixels, scattered))?)),
         }
     }
 
@@ -67,7 +68,9 @@ impl SdimModel {
     /// [`crate::Error::Tensors`] on mismatched shapes.
     pub fn read_encoded(&self, pixels: &Pixels, encoded: Encoded, sparse: &SparseDepth) -> Result<Prefix> {
         let frame = match encoded {
-            Encoded::Once(tokens) => return self.read_prefix(pixels, &tokens, sparse),
+            Encoded::Once(tokens) => {
+                return kernels::in_pool(|| self.read_prefix(pixels, &tokens, sparse));
+            }
             Encoded::PerQuery(frame) => *frame,
         };
         let resized = (pixels.resized.width() as usize, pixels.resized.height() as usize);
