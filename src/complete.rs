@@ -67,6 +67,9 @@ pub struct CompleteOptions {
     /// Whether to ask at measured pixels too and to spread the difference over the map, so that it passes through the
     /// measurements.
     pub align: bool,
+    /// Bytes that a batch of queries may take beside the weights and the frame, about; smaller batches are slower and give
+    /// the same answers. `None` for batches of 2048 rows.
+    pub max_memory: Option<usize>,
     /// How pixels that were not asked are filled.
     pub fill: Arc<dyn Fill>,
     /// Told after each batch.
@@ -82,6 +85,7 @@ impl Default for CompleteOptions {
             preserve: Preserve::default(),
             answer: None,
             align: true,
+            max_memory: None,
             fill: Arc::new(EdgeAwareFill::default()),
             progress: None,
             cancel: None,
@@ -96,6 +100,7 @@ impl std::fmt::Debug for CompleteOptions {
             .field("preserve", &self.preserve)
             .field("answer", &self.answer)
             .field("align", &self.align)
+            .field("max_memory", &self.max_memory)
             .finish_non_exhaustive()
     }
 }

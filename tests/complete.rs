@@ -170,6 +170,33 @@ fn progress_counts_up_and_a_token_stops() {
 }
 
 #[test]
+fn a_memory_limit_makes_smaller_batches_and_the_same_map() {
+    let (rgb, sparse, _) = frame(100);
+    let run = |max_memory: Option<usize>| {
+        let steps = Arc::new(Mutex::new(vec![0]));
+        let seen = steps.clone();
+        let options = CompleteOptions {
+            max_memory,
+            progress: Some(Arc::new(move |p| seen.lock().unwrap().push(p.answered))),
+            ..options(QueryPlan::Stride(8))
+        };
+        let map = TINY.complete(&rgb, &sparse, &options).unwrap();
+        let largest = steps.lock().unwrap().windows(2).map(|s| s[1] - s[0]).max().unwrap();
+        (map, largest)
+    };
+    let (free, all) = run(None);
+    // A row of the tiny model takes 15 kB: 8 x 192 + 3 x 512 values in passing, 2 x 4 x 96 kept.
+    let (tight, thirteen) = run(Some(200_000));
+    let (least, one) = run(Some(1));
+    assert!(all > 200 && thirteen == 13 && one == 1, "{all}, {thirteen}, {one}");
+    for map in [&tight, &least] {
+        for (a, b) in map.depth().iter().zip(free.depth()) {
+            assert!((a - b).abs() <= 1e-3 * b, "{a} is not {b}");
+        }
+    }
+}
+
+#[test]
 fn the_completer_is_shared_between_threads() {
     fn shared<T: Send + Sync>(_: &T) {}
     shared(&*TINY);

@@ -8,7 +8,7 @@ use crate::error::Result;
 use crate::model::SdimModel;
 use crate::query::plan::{Asked, lattice, refine_pixels, stride_within};
 use crate::query::prompt::choose_evenly;
-use crate::query::{Hint, Prefix, Query, QueryPlan, Reading, ask_as};
+use crate::query::{Hint, Prefix, Query, QueryPlan, Reading, ask_within};
 use crate::refine::{Answered, FillInput};
 use image::RgbImage;
 
@@ -71,7 +71,8 @@ impl<'a> Questions<'a> {
     ) -> Result<Vec<Reading>> {
         let queries: Vec<Query> = pixels.iter().map(|&p| self.query(p, tell)).collect();
         let mode = self.options.answer.as_ref().unwrap_or(&self.model.prompts.settings().answer_mode);
-        ask_as(self.model, self.prefix, &queries, mode, &mut |answered| {
+        let limit = self.options.max_memory;
+        ask_within(self.model, self.prefix, &queries, mode, limit, &mut |answered| {
             if let Some(callback) = &self.options.progress {
                 callback(Progress { answered: before + answered, planned });
             }

@@ -53,10 +53,27 @@ pub fn ask_as(
     mode: &AnswerMode,
     progress: &mut dyn FnMut(usize) -> bool,
 ) -> Result<Vec<Reading>> {
+    ask_within(model, prefix, queries, mode, None, progress)
+}
+
+/// As [`ask_as`], in batches that take about `max_memory` bytes beside the weights and the prefix, at the least one query
+/// at a time. The answers are the same for any limit.
+///
+/// # Errors
+/// As [`ask_as`].
+pub fn ask_within(
+    model: &SdimModel,
+    prefix: &Prefix,
+    queries: &[Query],
+    mode: &AnswerMode,
+    max_memory: Option<usize>,
+    progress: &mut dyn FnMut(usize) -> bool,
+) -> Result<Vec<Reading>> {
     let unit = prefix.space.unit;
+    let rows = rows_within(model, max_memory);
     match mode {
         AnswerMode::Digits => {
-            let plan = Plan { forced: true, room: 0 };
+            let plan = Plan { forced: true, room: 0, rows };
             in_batches(model, prefix, queries, plan, progress, Reading::INVALID, &mut |mut batch| {
                 let readings = forced_numbers(&mut batch)?.into_iter();
                 Ok(readings
@@ -66,10 +83,20 @@ pub fn ask_as(
         }
         AnswerMode::Generate(generation) => {
             let grammar = AnswerGrammar::new(&model.prompts.settings().template, unit);
-            let spoken = generate(model, prefix, queries, generation, progress)?;
+            let spoken = speak(model, prefix, queries, generation, rows, progress)?;
             spoken.par_iter().map(|s| s.reading(&grammar, &model.tokenizer)).collect()
         }
     }
+}
+
+/// Rows of a decoder pass whose activations and own keys and values fit into a limit.
+fn rows_within(model: &SdimModel, max_memory: Option<usize>) -> usize {
+    let t = &model.vlm.config.text;
+    // A layer holds about eight rows of its width at once (sums, norms, heads), and three of the MLP's.
+    let passing = 8 * t.hidden_size + 3 * t.intermediate_size;
+    let kept = 2 * t.layers * t.kv_heads * t.head_dim();
+    let bytes = (passing + kept).max(1) * size_of::<f32>();
+    max_memory.map_or(ROWS, |limit| (limit / bytes).clamp(1, ROWS))
 }
 
 /// Lets the model answer each query freely, token by token, and returns what it said, in the order of the queries.
@@ -83,10 +110,21 @@ pub fn generate(
     generation: &Generation,
     progress: &mut dyn FnMut(usize) -> bool,
 ) -> Result<Vec<Spoken>> {
+    speak(model, prefix, queries, generation, ROWS, progress)
+}
+
+fn speak(
+    model: &SdimModel,
+    prefix: &Prefix,
+    queries: &[Query],
+    generation: &Generation,
+    rows: usize,
+    progress: &mut dyn FnMut(usize) -> bool,
+) -> Result<Vec<Spoken>> {
     let settings = model.prompts.settings();
     AnswerMode::Generate(generation.clone()).validate("answer mode", settings)?;
     let voice = Voice::new(model, generation)?;
-    let plan = Plan { forced: false, room: generation.max_new_tokens };
+    let plan = Plan { forced: false, room: generation.max_new_tokens, rows };
     in_batches(model, prefix, queries, plan, progress, Spoken::default(), &mut |mut batch| {
         voice.speak(&mut batch)
     })
@@ -99,6 +137,8 @@ struct Plan {
     forced: bool,
     /// Tokens that may follow each suffix.
     room: usize,
+    /// Rows of one decoder pass, at most.
+    rows: usize,
 }
 
 /// Cuts the queries into batches of equally long suffixes, and puts what `answer` makes of them into their order.
@@ -132,7 +172,7 @@ fn in_batches<T: Clone + Send>(
                 None => length + plan.room,
                 Some(marked) => marked.patches().max(marked.opening().len() + length + plan.room),
             };
-            for batch in members.chunks((ROWS / rows.max(1)).max(1)) {
+            for batch in members.chunks((plan.rows / rows.max(1)).max(1)) {
                 let asked: Vec<&Query> = batch.iter().map(|&i| &chunk[i]).collect();
                 let tokens: Vec<&Tokens> = batch.iter().map(|&i| &suffixes[i]).collect();
                 let answers = kernels::in_pool(|| answer(Batch::open(model, prefix, &asked, &tokens)?))?;

@@ -14,7 +14,7 @@ pub mod settings;
 pub mod template;
 
 pub use answer::{AnswerGrammar, parse_depth};
-pub use ask::{ask, ask_as, generate};
+pub use ask::{ask, ask_as, ask_within, generate};
 pub use generate::Spoken;
 pub use marker::{Marker, MarkerShape};
 pub use mode::{AnswerMode, Generation};
