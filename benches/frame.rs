@@ -1,6 +1,7 @@
 //! Stages of one 640x480 frame on the embedded checkpoint: `cargo bench --bench frame`.
 
 use criterion::{Criterion, criterion_group, criterion_main};
+use sdim::fusion::Normalise;
 use sdim::query::{Query, ask};
 use sdim::refine::{Answered, EdgeAwareFill, Fill, FillInput};
 use sdim::scenes::{procedural, sample_points};
@@ -20,6 +21,15 @@ fn frame(c: &mut Criterion) {
     let mut group = c.benchmark_group("tiny-640x480");
     group.sample_size(10);
     group.bench_function("preprocess", |b| b.iter(|| model.preprocess(&frame.rgb, &sparse)));
+    let patches = model.preprocessor.patches(&pixels, &model.device).expect("patches");
+    group.bench_function("patch-embed", |b| b.iter(|| model.vlm.vision.patch_embed.forward(&patches)));
+    let image =
+        model.preprocessor.image(&pixels, &model.device).expect("an image").unsqueeze(0).expect("a batch");
+    let injection = model.injection.as_ref().expect("a fusion block");
+    group.bench_function("fusion", |b| {
+        b.iter(|| injection.fusion.forward(&image, &scattered, Normalise::Running));
+    });
+    group.bench_function("vision", |b| b.iter(|| model.vlm.encode(&patches, &[pixels.grid])));
     group.bench_function("encode", |b| b.iter(|| model.encode(&pixels, &scattered)));
     group.bench_function("prefill", |b| b.iter(|| model.read_prefix(&pixels, &tokens, &sparse)));
     group.bench_function("ask-4096", |b| b.iter(|| ask(model, &prefix, &queries, &mut |_| true)));

@@ -3,17 +3,7 @@
 
 pub mod stdout;
 
-use sdim::system::device;
 use sdim::{DepthCompleter, LoadOptions};
-use std::path::Path;
-
-/// Loads `tiny` or a checkpoint directory, with an adapter if given.
-pub fn load(model: &str, adapter: Option<&Path>, device_name: &str) -> anyhow::Result<DepthCompleter> {
-    load_as(
-        model,
-        &LoadOptions { adapter: adapter.map(Path::to_path_buf), ..LoadOptions::on(&device(device_name)?) },
-    )
-}
 
 /// Loads `tiny` or a checkpoint directory.
 pub fn load_as(model: &str, options: &LoadOptions) -> anyhow::Result<DepthCompleter> {

@@ -45,7 +45,7 @@ use anyhow::{Context, bail, ensure};
 use clap::Parser;
 use sdim::benchmarks::Layout;
 use sdim::scenes::SparsePattern;
-use sdim::{DepthScale, QueryPlan};
+use sdim::{DepthScale, LoadOptions, QueryPlan, WeightFormat};
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 use std::str::FromStr;
@@ -105,6 +105,9 @@ pub struct Args {
     /// Pixels to ask: every, stride:N or budget:N.
     #[arg(long, default_value_t = Default::default())]
     plan: QueryPlan,
+    /// How matrices of checkpoints are held: f32, bf16 or int8; without it, what this machine multiplies best.
+    #[arg(long)]
+    weights: Option<WeightFormat>,
     /// cpu, cuda:N or metal.
     #[arg(long, default_value = "cpu")]
     device: String,
@@ -117,7 +120,7 @@ pub struct Args {
     /// Make the report of finished runs or shards instead of running; into --out if given.
     #[arg(long, num_args = 1.., value_name = "DIR", conflicts_with_all = [
         "data", "procedural", "layout", "depth_scale", "range", "points", "pattern", "resample", "score", "seed", "limit",
-        "checkpoint", "adapter", "methods", "plan", "device", "shard", "figures", "verbose"])]
+        "checkpoint", "adapter", "methods", "plan", "weights", "device", "shard", "figures", "verbose"])]
     merge: Vec<PathBuf>,
     /// Draw the first frames into this folder, all methods and their errors beside each other.
     #[arg(long)]
@@ -172,6 +175,16 @@ fn pair(text: &str) -> Result<(f32, f32), String> {
 }
 
 impl Args {
+    /// How checkpoints are loaded.
+    fn options(&self) -> sdim::Result<LoadOptions> {
+        let device = sdim::system::device(&self.device)?;
+        Ok(LoadOptions {
+            weights: self.weights.unwrap_or(WeightFormat::native(&device)),
+            adapter: self.adapter.clone(),
+            ..LoadOptions::on(&device)
+        })
+    }
+
     /// Numbers of points to draw; 0 alone where nothing is drawn, since all frames have their own.
     fn points(&self, all_own: bool) -> anyhow::Result<Vec<usize>> {
         if all_own && !self.resample {

@@ -1,6 +1,6 @@
 //! What is compared: checkpoints and baselines.
 
-use crate::common::load;
+use crate::common::load_as;
 use crate::{Args, settings};
 use anyhow::{Context, bail, ensure};
 use image::RgbImage;
@@ -73,15 +73,15 @@ pub fn load_all(args: &Args) -> anyhow::Result<Vec<Method>> {
         bail!("--methods {unknown}: expected some of {}", all().collect::<Vec<_>>().join(", "));
     }
     let wanted = |name: &str| args.methods.is_empty() || args.methods.iter().any(|m| m == name);
-    let mut methods = Vec::new();
+    let (mut methods, options) = (Vec::new(), args.options()?);
     for (checkpoint, name) in checkpoints.iter().zip(&names).filter(|(_, name)| wanted(name)) {
-        let completer = load(checkpoint, args.adapter.as_deref(), &args.device)
-            .with_context(|| format!("--checkpoint {checkpoint}"))?;
-        let options = CompleteOptions { plan: args.plan, ..Default::default() };
+        let completer =
+            load_as(checkpoint, &options).with_context(|| format!("--checkpoint {checkpoint}"))?;
+        let asking = CompleteOptions { plan: args.plan, ..Default::default() };
         methods.push(Method {
             name: name.clone(),
             fingerprint: settings::fingerprint(checkpoint, args.adapter.as_deref())?,
-            kind: Kind::Checkpoint(Box::new(completer), options),
+            kind: Kind::Checkpoint(Box::new(completer), asking),
         });
     }
     for baseline in Baseline::ALL.into_iter().filter(|b| wanted(b.name())) {

@@ -23,10 +23,10 @@ pub fn markdown(report: &Tables) -> String {
         Score::All => "all pixels with ground truth, measured ones included (`--score all`)",
     };
     let mut text = format!(
-        "# Evaluation\n\n{} frames of layout {}, {drawn}, seed {}, plan {}. Means over frames, in brackets 95 % bootstrap \
+        "# Evaluation\n\n{} frames of layout {}, {drawn}, seed {}, plan {}, {} weights. Means over frames, in brackets 95 % bootstrap \
          intervals over frames; errors over {counted}. Always over all pixels: GE. Never over measured ones: errors by region, and \
          confidence.\n",
-        s.frames, s.layout, s.seed, s.plan
+        s.frames, s.layout, s.seed, s.plan, s.weights
     );
     report.tables.iter().for_each(|t| table(&mut text, t));
     text
