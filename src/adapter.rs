@@ -5,13 +5,13 @@
 //! second patch embedding (`sdim.patch_embed.*`), and the factors `{layer}.lora_A.weight` and `{layer}.lora_B.weight`.
 
 use crate::error::{Error, Result};
-use crate::files::write_whole;
+use crate::files::{write_tensors, write_whole};
 use crate::model::Parts;
 use crate::query::Settings;
 use crate::vlm::config::VlmConfig;
 use crate::vlm::weights::{StoredFile, Weights};
 use candle_core::{Device, Tensor};
-use std::collections::{BTreeMap, HashMap};
+use std::collections::BTreeMap;
 use std::path::Path;
 
 /// File of an adapter's settings.
@@ -48,12 +48,8 @@ impl Adapter {
     /// [`Error::Io`]; [`Error::Config`] if the settings could not be read back.
     pub fn save(&self, dir: &Path) -> Result<()> {
         let json = self.settings.to_json()?;
-        let path = dir.join(TENSORS);
-        let tensors: HashMap<&String, &Tensor> = self.tensors.iter().collect();
-        let bytes = safetensors::serialize(tensors, None)
-            .map_err(|e| Error::format(&path, e.to_string(), "tensors that safetensors can hold"))?;
         std::fs::create_dir_all(dir).map_err(Error::io(dir))?;
-        write_whole(&path, &bytes)?;
+        write_tensors(&dir.join(TENSORS), &self.tensors)?;
         write_whole(&dir.join(SETTINGS), json.as_bytes())
     }
 

@@ -5,6 +5,7 @@ use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use crate::error::{Error, Result};
+use candle_core::Tensor;
 
 /// Bytes of a configuration or vocabulary, at most. Published vocabularies have 7 to 20 MB.
 pub(crate) const TEXT_LIMIT: u64 = 64 << 20;
@@ -33,6 +34,16 @@ pub(crate) fn write_whole(path: &Path, bytes: &[u8]) -> Result<()> {
         let _ = fs::remove_file(&part);
     }
     written.map_err(Error::io(path))
+}
+
+/// Writes tensors by name as a whole safetensors file, each in its own type.
+pub(crate) fn write_tensors<'a>(
+    path: &Path,
+    tensors: impl IntoIterator<Item = (&'a String, &'a Tensor)>,
+) -> Result<()> {
+    let bytes = safetensors::serialize(tensors, None)
+        .map_err(|e| Error::format(path, e.to_string(), "tensors that safetensors can hold"))?;
+    write_whole(path, &bytes)
 }
 
 fn part_path(path: &Path) -> Result<PathBuf> {

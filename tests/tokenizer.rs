@@ -3,6 +3,8 @@
 //! `tests/fixtures/chat.json` is written by `tests/reference/make_chat.py`. The published tokenizer is not part of the
 //! repository: what needs it looks for a directory beside it and says so when it is not there.
 
+mod common;
+
 use sdim::vlm::chat::{ChatPrompt, Message, Part, Role, expand_image_placeholders};
 use sdim::vlm::config::{SpecialIds, VlmConfig};
 use sdim::vlm::preprocess::PreprocessorConfig;
@@ -15,12 +17,7 @@ fn json(path: &Path) -> Value {
 }
 
 fn published() -> Option<PathBuf> {
-    let dir = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/tokenizer");
-    if !dir.join("tokenizer.json").exists() {
-        println!("skipped: {} is not there", dir.display());
-        return None;
-    }
-    Some(dir)
+    common::beside("tokenizer", "tokenizer.json")
 }
 
 fn ids_of(value: &Value) -> Vec<u32> {

@@ -6,6 +6,7 @@ use super::mode::Generation;
 use super::number::{CONFIDENT_WITHIN, NumberFormat, Reading};
 use crate::error::{Error, Result};
 use crate::model::SdimModel;
+use crate::vlm::generate::penalise;
 use crate::vlm::tokenizer::Tokenizer;
 use candle_core::DType;
 use rayon::prelude::*;
@@ -127,18 +128,6 @@ impl<'a> Voice<'a> {
         let total: f32 = logits.iter().map(|l| (l - max).exp()).sum();
         let p = |id: u32| logits.get(id as usize).map_or(0.0, |l| (l - max).exp() / total);
         Some(Choice { id: id as u32, probability: 1.0 / total, digits: self.digits.map(p) })
-    }
-}
-
-/// Makes the tokens that were seen less likely, once each, as the reference's generation does.
-fn penalise(logits: &mut [f32], seen: impl Iterator<Item = u32>, penalty: f32) {
-    let mut seen: Vec<u32> = seen.collect();
-    seen.sort_unstable();
-    seen.dedup();
-    for id in seen {
-        if let Some(l) = logits.get_mut(id as usize) {
-            *l = if *l < 0.0 { *l * penalty } else { *l / penalty };
-        }
     }
 }
 
@@ -311,12 +300,5 @@ mod tests {
     fn nothing_readable_is_invalid() {
         let r = read("far away", &[]);
         assert!(r.value.is_nan() && r.expected_error.is_nan() && r.confidence == 0.0);
-    }
-
-    #[test]
-    fn penalties_count_once_and_push_down() {
-        let mut logits = [2.0, -2.0, 1.0];
-        penalise(&mut logits, [0, 1, 0, 77].into_iter(), 2.0);
-        assert_eq!(logits, [1.0, -4.0, 1.0]);
     }
 }

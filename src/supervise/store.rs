@@ -3,15 +3,10 @@
 use super::init::FreshFiles;
 use super::optimiser::Parameters;
 use crate::error::{Error, Result};
-use crate::files::write_whole;
+use crate::files::{write_tensors, write_whole};
 use candle_core::{DType, Device, Tensor};
 use std::collections::HashMap;
 use std::path::Path;
-
-fn serialise(path: &Path, tensors: &HashMap<String, Tensor>) -> Result<Vec<u8>> {
-    safetensors::serialize(tensors, None)
-        .map_err(|e| Error::format(path, e.to_string(), "tensors that safetensors can hold"))
-}
 
 /// Writes a checkpoint directory that [`crate::model::SdimModel::load`] reads: the averaged weights as bf16.
 ///
@@ -23,8 +18,7 @@ pub fn publish(dir: &Path, files: &FreshFiles, parameters: &Parameters) -> Resul
     for (name, tensor) in parameters.averages()? {
         tensors.insert(name, tensor.to_dtype(DType::BF16)?);
     }
-    let path = dir.join("model.safetensors");
-    write_whole(&path, &serialise(&path, &tensors)?)?;
+    write_tensors(&dir.join("model.safetensors"), &tensors)?;
     for (name, text) in [
         ("config.json", &files.config),
         ("preprocessor_config.json", &files.preprocessor),
@@ -50,8 +44,7 @@ pub fn save_state(dir: &Path, parameters: &Parameters, step: usize) -> Result<()
         }
     }
     tensors.insert("step".into(), Tensor::new(&[step as u32], &Device::Cpu)?);
-    let path = dir.join("trainer.safetensors");
-    write_whole(&path, &serialise(&path, &tensors)?)
+    write_tensors(&dir.join("trainer.safetensors"), &tensors)
 }
 
 /// Reads what [`save_state`] wrote and returns the number of finished steps.

@@ -8,7 +8,6 @@ use super::rope::Position;
 use crate::error::{Error, Result};
 use candle_core::{DType, Tensor};
 use candle_transformers::generation::{LogitsProcessor, Sampling};
-use candle_transformers::utils::apply_repeat_penalty;
 use serde_json::Value;
 use std::path::Path;
 
@@ -142,7 +141,9 @@ impl QwenVl {
             let logits = if options.repetition_penalty == 1.0 {
                 logits
             } else {
-                apply_repeat_penalty(&logits, options.repetition_penalty, &seen)?
+                let mut values = logits.to_vec1::<f32>()?;
+                penalise(&mut values, seen.iter().copied(), options.repetition_penalty);
+                Tensor::from_vec(values, usable, logits.device())?
             };
             let id = sampler.sample(&logits)?;
             if options.stop_ids.contains(&id) {
@@ -157,6 +158,18 @@ impl QwenVl {
             hidden = self.prefill(&self.decoder.embed(&[id])?, &[position], &mut cache, Keep::Last)?;
         }
         Ok(answer)
+    }
+}
+
+/// Makes the tokens that were seen less likely, once each, as the reference's generation does.
+pub(crate) fn penalise(logits: &mut [f32], seen: impl Iterator<Item = u32>, penalty: f32) {
+    let mut seen: Vec<u32> = seen.collect();
+    seen.sort_unstable();
+    seen.dedup();
+    for id in seen {
+        if let Some(l) = logits.get_mut(id as usize) {
+            *l = if *l < 0.0 { *l * penalty } else { *l / penalty };
+        }
     }
 }
 
@@ -224,5 +237,12 @@ mod tests {
             let error = with(tokens, penalty).check();
             assert!(matches!(error, Err(Error::Argument { .. })), "{tokens} {penalty}: {error:?}");
         }
+    }
+
+    #[test]
+    fn penalties_count_once_and_push_down() {
+        let mut logits = [2.0, -2.0, 1.0];
+        penalise(&mut logits, [0, 1, 0, 77].into_iter(), 2.0);
+        assert_eq!(logits, [1.0, -4.0, 1.0]);
     }
 }

@@ -145,11 +145,6 @@ impl Weights {
         Ok(())
     }
 
-    /// Adds tensors that are already in memory, which replace those of the same name.
-    pub fn add_tensors(&mut self, tensors: HashMap<String, Tensor>) {
-        self.sources.extend(tensors.into_iter().map(|(name, t)| (published_name(&name), Source::Tensor(t))));
-    }
-
     /// In what form matrices are kept; [`WeightFormat::F32`] unless told. Vectors, convolutions and LoRA factors are
     /// always f32.
     pub fn with_format(mut self, format: WeightFormat) -> Self {

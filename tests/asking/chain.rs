@@ -1,7 +1,8 @@
 //! Forced and free answers on a model that says what it is told to say, and what is refused.
 
 use crate::common::tiny;
-use crate::setup::{DISC, Setup, by_coordinates, by_marker, close};
+use crate::common::{beside, close};
+use crate::setup::{DISC, Setup, by_coordinates, by_marker};
 use candle_core::{Device, Tensor};
 use sdim::model::SdimModel;
 use sdim::query::{
@@ -10,7 +11,6 @@ use sdim::query::{
 };
 use sdim::vlm::tokenizer::Tokenizer;
 use sdim::{CompleteOptions, DepthCompleter, Error, QueryPlan};
-use std::path::Path;
 
 /// A model whose next token hangs on the last one alone: after an unmeasured pixel it says `d=4.25m`, where the 4 might
 /// have been a 9, after a measured one `7m`, and then it stops.
@@ -144,12 +144,8 @@ fn what_does_not_go_together_is_refused() {
 
 #[test]
 fn the_published_tokenizer_writes_forced_and_free_answers_alike() {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/tokenizer/tokenizer.json");
-    if !path.exists() {
-        println!("skipped: {} is not there", path.display());
-        return;
-    }
-    let tokenizer = Tokenizer::from_file(&path).unwrap();
+    let Some(dir) = beside("tokenizer", "tokenizer.json") else { return };
+    let tokenizer = Tokenizer::from_file(&dir.join("tokenizer.json")).unwrap();
     let encode = |text: &str| tokenizer.encode(text).unwrap();
     for (template, number) in [(PromptTemplate::paper(), "4.230"), (PromptTemplate::depthlm(), "12.05")] {
         let (before, after) = template.answer.split_once("{y}").unwrap();

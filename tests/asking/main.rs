@@ -7,11 +7,12 @@ mod common;
 mod setup;
 
 use candle_core::Tensor;
+use common::close;
 use common::{relative_difference, tiny};
 use sdim::query::{Generation, Marker, PixelReference, PromptTemplate, Query, Settings, Spoken};
 use sdim::vlm::decoder::Keep;
 use sdim::vlm::rope::Position;
-use setup::{DISC, Setup, by_coordinates, by_marker, close};
+use setup::{DISC, Setup, by_coordinates, by_marker};
 
 #[test]
 fn marked_frames_are_encoded_exactly_as_if_from_scratch() {

@@ -13,9 +13,6 @@ use sdim::query::{
 use sdim::vlm::decoder::Keep;
 use sdim::vlm::prompt::positions;
 
-/// Largest difference, relative to the largest value.
-pub const TOLERANCE: f64 = 1e-4;
-
 pub const DIGITS: NumberFormat = NumberFormat::Digits { decimals: 2, integers: 2 };
 pub const DISC: Marker = Marker { shape: MarkerShape::Disc, size: 6, colour: [255, 0, 0] };
 
@@ -154,16 +151,5 @@ impl Setup {
 
     pub fn digits(&self, queries: &[Query]) -> Vec<Reading> {
         ask_as(&self.model, &self.prefix, queries, &AnswerMode::Digits, &mut |_| true).unwrap()
-    }
-}
-
-pub fn close(what: &str, a: &Reading, b: &Reading) {
-    for (name, a, b) in [
-        ("value", a.value, b.value),
-        ("confidence", a.confidence, b.confidence),
-        ("expected error", a.expected_error, b.expected_error),
-    ] {
-        let difference = f64::from((a - b).abs() / a.abs().max(b.abs()).max(1e-3));
-        assert!(difference <= 10.0 * TOLERANCE, "{what}: {name} {a} and {b}");
     }
 }

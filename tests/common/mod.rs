@@ -6,6 +6,7 @@ pub mod random;
 pub mod tiny;
 
 use candle_core::{DType, Device, Tensor};
+use sdim::query::Reading;
 use std::cell::RefCell;
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::path::{Path, PathBuf};
@@ -221,4 +222,27 @@ pub fn program(name: &str) -> PathBuf {
 
 fn values(tensor: &Tensor) -> Vec<f32> {
     tensor.to_dtype(DType::F32).unwrap().flatten_all().unwrap().to_vec1().unwrap()
+}
+
+/// Two readings of one query agree to 1e-3: ten times what is allowed of the states that they are read from, since
+/// exponentials and quotients lie between.
+pub fn close(what: &str, a: &Reading, b: &Reading) {
+    for (name, a, b) in [
+        ("value", a.value, b.value),
+        ("confidence", a.confidence, b.confidence),
+        ("expected error", a.expected_error, b.expected_error),
+    ] {
+        let difference = f64::from((a - b).abs() / a.abs().max(b.abs()).max(1e-3));
+        assert!(difference <= 1e-3, "{what}: {name} {a} and {b}");
+    }
+}
+
+/// A folder that may lie beside the repository, if it holds `file`; says so if not.
+pub fn beside(folder: &str, file: &str) -> Option<PathBuf> {
+    let dir = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared").join(folder);
+    if !dir.join(file).exists() {
+        println!("skipped: {} is not there", dir.join(file).display());
+        return None;
+    }
+    Some(dir)
 }

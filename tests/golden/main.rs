@@ -28,12 +28,7 @@ fn own_fixture() -> PathBuf {
 
 /// A second set of golden tensors that may lie beside the repository.
 fn other_fixture() -> Option<PathBuf> {
-    let dir = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/golden");
-    if !dir.join("golden.safetensors").exists() {
-        println!("skipped: {} is not there", dir.display());
-        return None;
-    }
-    Some(dir)
+    common::beside("golden", "golden.safetensors")
 }
 
 fn json(path: &Path) -> serde_json::Value {
