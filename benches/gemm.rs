@@ -31,6 +31,9 @@ struct Args {
     /// What `cargo bench` adds.
     #[arg(long, hide = true)]
     bench: bool,
+    /// One small product, to see that it runs: `cargo bench -- --test`.
+    #[arg(long, hide = true)]
+    test: bool,
 }
 
 enum Weight {
@@ -71,7 +74,11 @@ fn time<R>(by_thread: bool, f: impl FnOnce() -> R) -> (f64, R) {
 }
 
 fn main() -> Result<()> {
-    let args = Args::parse();
+    let mut args = Args::parse();
+    // Without any argument it is `cargo test --benches` that runs this.
+    if args.test || std::env::args().len() == 1 {
+        (args.shapes, args.rows, args.seconds) = (vec!["100x70".to_string()], vec![3], 0.0);
+    }
     let pool = rayon::ThreadPoolBuilder::new().num_threads(args.threads);
     if args.threads == 1 { pool.use_current_thread() } else { pool }.build_global()?;
     for shape in &args.shapes {

@@ -16,16 +16,18 @@ use sdim::vlm::weights::Weights;
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
-struct Family {
+pub const NAMES: [&str; 6] = ["like_3b", "like_7b", "merge_3", "merge_1", "window_1", "window_7"];
+
+pub struct Family {
     dir: PathBuf,
     name: &'static str,
     meta: serde_json::Value,
-    config: VlmConfig,
+    pub config: VlmConfig,
     preprocessor: PreprocessorConfig,
 }
 
 impl Family {
-    fn new(name: &'static str) -> Self {
+    pub fn new(name: &'static str) -> Self {
         let dir = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/family");
         let meta = json(&dir.join(format!("{name}.json")));
         let config = VlmConfig::from_json("config", &meta["config"]).unwrap();
@@ -58,13 +60,26 @@ impl Family {
         (self.preprocessor.patches(&pixels, &CPU).unwrap(), pixels.grid)
     }
 
+    pub fn golden(&self, allowed: Allowed) -> Golden {
+        Golden::file(&self.dir.join(format!("{}.safetensors", self.name)), allowed)
+    }
+
+    /// Prompts, named by the letters of their images; `-` is text alone.
+    pub fn cases(&self) -> impl Iterator<Item = &str> {
+        self.meta["cases"].as_array().unwrap().iter().map(|case| case.as_str().unwrap())
+    }
+
+    /// The rows and the grids of a prompt's images.
+    pub fn images(&self, case: &str) -> (Option<Tensor>, Vec<Grid>) {
+        let letters = case.chars().filter(|&letter| letter != '-');
+        let (rows, grids): (Vec<_>, Vec<_>) = letters.map(|letter| self.image(letter)).unzip();
+        ((!rows.is_empty()).then(|| Tensor::cat(&rows, 0).unwrap()), grids)
+    }
+
     fn check(&self, model: &QwenVl, allowed: Allowed) {
-        let golden = Golden::file(&self.dir.join(format!("{}.safetensors", self.name)), allowed);
-        for case in self.meta["cases"].as_array().unwrap() {
-            let name = case.as_str().unwrap();
-            let letters = name.chars().filter(|&letter| letter != '-');
-            let (rows, grids): (Vec<_>, Vec<_>) = letters.map(|letter| self.image(letter)).unzip();
-            let rows = (!rows.is_empty()).then(|| Tensor::cat(&rows, 0).unwrap());
+        let golden = self.golden(allowed);
+        for name in self.cases() {
+            let (rows, grids) = self.images(name);
             let checksum = rows.iter().map(|rows| i64::from(random::checksum([rows])));
             golden.exact(&format!("{name}.pixel_values_crc32"), checksum);
             Case { golden: &golden, model, name, grids }.check(rows.as_ref());

@@ -6,6 +6,7 @@
 #[path = "../common/mod.rs"]
 mod common;
 mod family;
+mod formats;
 mod stages;
 
 use candle_core::{DType, Device, Tensor};
