@@ -8,7 +8,7 @@ use candle_core::{Device, Tensor};
 use clap::Parser;
 use cpu_time::ThreadTime;
 use sdim::WeightFormat;
-use sdim::kernels::{PackedGate, PackedWeight};
+use sdim::kernels::{PackedGate, PackedWeight, Rows};
 use std::time::Instant;
 
 #[derive(Parser)]
@@ -56,13 +56,11 @@ fn weight(format: &str, m: usize, k: usize) -> Result<Weight> {
         "int8" => WeightFormat::Int8,
         other => anyhow::bail!("format {other}; expected bf16 or int8"),
     };
-    let one = match format {
-        WeightFormat::Int8 => {
-            PackedWeight::int8_from_rows(m, k, |row, out| out.copy_from_slice(&all[row * k..(row + 1) * k]))?
-        }
-        _ => PackedWeight::bf16_from_f32(&all, m, k)?,
-    };
-    Ok(if gate { Weight::Gate(PackedGate::new((&one, None), (&one, None))?) } else { Weight::Plain(one) })
+    let rows = Rows::f32(&all, m, k)?;
+    Ok(match gate {
+        true => Weight::Gate(PackedGate::new(format, (rows, None), (rows, None))?),
+        false => Weight::Plain(PackedWeight::new(format, &[rows])?),
+    })
 }
 
 /// Seconds that `f` takes: of this thread's processor time, or on the wall.

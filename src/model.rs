@@ -182,7 +182,7 @@ impl SdimModel {
         let Parts { vlm, injection, glimpse } = Parts::new(config, &settings, weights)?;
         weights.finish()?;
         let number_rows = vlm.decoder.head_rows(&prompts.numbers().ids)?;
-        let number_rows = Matrix::from_tensor(&number_rows, None, weights.format())?;
+        let number_rows = Matrix::from_tensor(&number_rows, weights.format())?;
         Ok(Self {
             vlm,
             injection,

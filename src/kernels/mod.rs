@@ -51,7 +51,7 @@ pub(crate) use exec::{in_pool, read};
 pub use linear::linear;
 pub use memory::keep_freed_memory;
 pub use norm::rms_norm;
-pub use packed::{PackedGate, PackedWeight, WeightFormat};
+pub use packed::{PackedGate, PackedWeight, Rows, WeightFormat};
 pub use peak::peak_gflops;
 pub use rope::rope;
 pub use scale_shift::{affine_act, batch_norm_act};

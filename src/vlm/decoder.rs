@@ -124,13 +124,13 @@ impl Decoder {
     /// As [`Weights::get`].
     pub fn new(config: &TextConfig, weights: &Weights, layout: RopeLayout) -> Result<Self> {
         let table = [config.vocab_size, config.hidden_size];
-        let embed_tokens = weights.matrix("model.embed_tokens.weight", table, None)?;
+        let embed_tokens = weights.matrix("model.embed_tokens.weight", table)?;
         let head = if config.tie_word_embeddings {
             // Merged or re-saved tied checkpoints can carry a redundant copy.
             weights.ignore("lm_head.weight");
             embed_tokens.clone()
         } else {
-            weights.matrix("lm_head.weight", table, None)?
+            weights.matrix("lm_head.weight", table)?
         };
         Ok(Self {
             embed_tokens,

@@ -2,10 +2,44 @@
 
 use super::lora::{Lora, LoraMode};
 use super::matrix::Matrix;
+use super::raw::{self, Raw};
 use super::weights::Weights;
-use crate::error::Result;
-use crate::kernels::{self, PackedGate};
+use crate::error::{Error, Result};
+use crate::kernels::{self, PackedGate, PackedWeight};
 use candle_core::Tensor;
+
+/// A layer as it is found, before its weight is kept in some form.
+struct Found<'w> {
+    weights: &'w Weights,
+    weight: Raw<'w>,
+    bias: Option<Tensor>,
+    lora: Option<Lora>,
+}
+
+impl<'w> Found<'w> {
+    fn new(weights: &'w Weights, name: &str, inputs: usize, outputs: usize, bias: bool) -> Result<Self> {
+        let lora = Lora::new(weights, name, inputs, outputs)?;
+        let weight = weights.raw(&format!("{name}.weight"), [outputs, inputs])?;
+        let (weight, lora) = match (lora, weights.lora().mode) {
+            (Some(lora), LoraMode::Merge) => {
+                (Raw::Tensor((weight.f32(weights.device())? + lora.delta()?)?), None)
+            }
+            (lora, _) => (weight, lora),
+        };
+        let bias = if bias { Some(weights.get(&format!("{name}.bias"), &[outputs])?) } else { None };
+        Ok(Self { weights, weight, bias, lora })
+    }
+
+    /// Whether it can be part of a packed weight with others.
+    fn joins(&self) -> bool {
+        self.lora.is_none() && self.weight.packs(self.weights.format(), self.weights.device())
+    }
+
+    fn keep(self) -> Result<Linear> {
+        let weight = Matrix::new(&self.weight, self.weights.format(), self.weights.device())?;
+        Ok(Linear { weight, bias: self.bias, lora: self.lora })
+    }
+}
 
 /// `x W^T + b`, weight `[out, in]`, and a low-rank addition where an adapter has one.
 pub struct Linear {
@@ -20,16 +54,7 @@ impl Linear {
     /// # Errors
     /// As [`Weights::get`].
     pub fn new(weights: &Weights, name: &str, inputs: usize, outputs: usize, bias: bool) -> Result<Self> {
-        let lora = Lora::new(weights, name, inputs, outputs)?;
-        let (added, lora) = match (lora, weights.lora().mode) {
-            (Some(lora), LoraMode::Merge) => (Some(lora.delta()?), None),
-            (lora, _) => (None, lora),
-        };
-        Ok(Self {
-            weight: weights.matrix(&format!("{name}.weight"), [outputs, inputs], added.as_ref())?,
-            bias: if bias { Some(weights.get(&format!("{name}.bias"), &[outputs])?) } else { None },
-            lora,
-        })
+        Found::new(weights, name, inputs, outputs, bias)?.keep()
     }
 
     /// `[n, in]` to `[n, out]`.
@@ -42,6 +67,62 @@ impl Linear {
             Some(lora) => kernels::add(&y, &lora.forward(x)?),
             None => Ok(y),
         }
+    }
+}
+
+/// Linear layers that read the same input: one product where their weights are packed and none has an addition of its own.
+pub struct JoinedLinear<const N: usize> {
+    form: Joined,
+    outputs: [usize; N],
+}
+
+enum Joined {
+    Apart(Vec<Linear>),
+    /// Outputs of each layer in turn.
+    Packed {
+        weight: PackedWeight,
+        bias: Option<Tensor>,
+    },
+}
+
+impl<const N: usize> JoinedLinear<N> {
+    /// Reads the layers of these names and outputs, each as [`Linear::new`] does.
+    ///
+    /// # Errors
+    /// As [`Weights::get`].
+    pub fn new(weights: &Weights, layers: [(&str, usize); N], inputs: usize, bias: bool) -> Result<Self> {
+        let found = layers.iter().map(|(name, outputs)| Found::new(weights, name, inputs, *outputs, bias));
+        let found = found.collect::<Result<Vec<_>>>()?;
+        let form = if found.iter().all(Found::joins) {
+            let parts: Vec<&Raw> = found.iter().map(|f| &f.weight).collect();
+            let biases: Vec<&Tensor> = found.iter().filter_map(|f| f.bias.as_ref()).collect();
+            let bias = if bias { Some(Tensor::cat(&biases, 0)?) } else { None };
+            Joined::Packed { weight: raw::pack(&parts, weights.format())?, bias }
+        } else {
+            Joined::Apart(found.into_iter().map(Found::keep).collect::<Result<_>>()?)
+        };
+        Ok(Self { form, outputs: layers.map(|(_, outputs)| outputs) })
+    }
+
+    /// `[n, in]` to `[n, out]` of each layer.
+    ///
+    /// # Errors
+    /// [`crate::Error::Argument`] or [`crate::Error::Tensors`] on another width.
+    pub fn forward(&self, x: &Tensor) -> Result<[Tensor; N]> {
+        let parts: Vec<Tensor> = match &self.form {
+            Joined::Apart(layers) => layers.iter().map(|layer| layer.forward(x)).collect::<Result<_>>()?,
+            Joined::Packed { weight, bias } => {
+                let all = weight.linear(x, bias.as_ref())?;
+                let mut first = 0;
+                let parts = self.outputs.iter().map(|&outputs| {
+                    let part = all.narrow(1, first, outputs)?.contiguous()?;
+                    first += outputs;
+                    Ok(part)
+                });
+                parts.collect::<Result<_>>()?
+            }
+        };
+        parts.try_into().map_err(|parts: Vec<_>| Error::argument("joined layers", parts.len(), N.to_string()))
     }
 }
 
@@ -87,13 +168,14 @@ impl GatedMlp {
     /// # Errors
     /// As [`Weights::get`].
     pub fn new(weights: &Weights, name: &str, width: usize, inner: usize, bias: bool) -> Result<Self> {
-        let gate = Linear::new(weights, &format!("{name}.gate_proj"), width, inner, bias)?;
-        let up = Linear::new(weights, &format!("{name}.up_proj"), width, inner, bias)?;
-        let inputs = match ((&gate.weight, &gate.lora), (&up.weight, &up.lora)) {
-            ((Matrix::Packed(g), None), (Matrix::Packed(u), None)) => {
-                GateUp::Joined(PackedGate::new((g, gate.bias.as_ref()), (u, up.bias.as_ref()))?)
-            }
-            _ => GateUp::Apart { gate, up },
+        let found = |part| Found::new(weights, &format!("{name}.{part}"), width, inner, bias);
+        let (gate, up) = (found("gate_proj")?, found("up_proj")?);
+        let inputs = if gate.joins() && up.joins() {
+            let (g, u) = (gate.weight.hold()?, up.weight.hold()?);
+            let (g, u) = ((g.rows()?, gate.bias.as_ref()), (u.rows()?, up.bias.as_ref()));
+            GateUp::Joined(PackedGate::new(weights.format(), g, u)?)
+        } else {
+            GateUp::Apart { gate: gate.keep()?, up: up.keep()? }
         };
         Ok(Self { inputs, down: Linear::new(weights, &format!("{name}.down_proj"), inner, width, bias)? })
     }
@@ -108,5 +190,127 @@ impl GatedMlp {
             GateUp::Joined(both) => both.apply(x)?,
         };
         self.down.forward(&gated)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::lora::{LoraConfig, LoraSet};
+    use super::*;
+    use crate::kernels::WeightFormat;
+    use candle_core::{DType, Device};
+    use std::collections::HashMap;
+
+    const WIDTH: usize = 12;
+    const LAYERS: [(&str, usize); 3] = [("a.q_proj", 40), ("a.k_proj", 7), ("a.v_proj", 16)];
+
+    fn random(shape: &[usize], seed: usize) -> Tensor {
+        let count = shape.iter().product::<usize>();
+        let values: Vec<f32> = (0..count).map(|i| ((i * 31 + seed * 17) % 101) as f32 / 50.0 - 1.0).collect();
+        Tensor::from_vec(values, shape, &Device::Cpu).unwrap()
+    }
+
+    fn values(tensor: &Tensor) -> Vec<f32> {
+        tensor.flatten_all().unwrap().to_vec1().unwrap()
+    }
+
+    /// A file with joined layers, an MLP, and LoRA factors for one of each, as a checkpoint stores them.
+    fn file(stored: DType) -> HashMap<String, Tensor> {
+        let mut tensors = HashMap::new();
+        let mut add = |name: String, shape: &[usize]| {
+            let tensor = random(shape, tensors.len()).to_dtype(stored).unwrap();
+            tensors.insert(name, tensor);
+        };
+        let mlp = [("m.gate_proj", 20), ("m.up_proj", 20)];
+        for (name, outputs) in LAYERS.into_iter().chain(mlp) {
+            add(format!("{name}.weight"), &[outputs, WIDTH]);
+            add(format!("{name}.bias"), &[outputs]);
+        }
+        add("m.down_proj.weight".into(), &[WIDTH, 20]);
+        add("m.down_proj.bias".into(), &[WIDTH]);
+        for (name, outputs) in [("a.k_proj", 7), ("m.up_proj", 20)] {
+            add(format!("{name}.lora_A.weight"), &[2, WIDTH]);
+            add(format!("{name}.lora_B.weight"), &[outputs, 2]);
+        }
+        tensors
+    }
+
+    fn weights(tensors: &HashMap<String, Tensor>, format: WeightFormat, lora: Option<LoraMode>) -> Weights {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("w.safetensors");
+        candle_core::safetensors::save(tensors, &path).unwrap();
+        let targets = vec!["k_proj".into(), "up_proj".into()];
+        let config = lora.map(|_| LoraConfig { rank: 2, alpha: 1.0, targets });
+        let lora = LoraSet { config, mode: lora.unwrap_or_default() };
+        let bytes = std::fs::read(&path).unwrap();
+        Weights::from_bytes("w", bytes, &Device::Cpu).unwrap().with_format(format).with_lora(lora)
+    }
+
+    const FORMATS: [WeightFormat; 3] = [WeightFormat::F32, WeightFormat::Bf16, WeightFormat::Int8];
+    const LORA: [Option<LoraMode>; 3] = [None, Some(LoraMode::Merge), Some(LoraMode::Apart)];
+
+    #[test]
+    fn joined_layers_are_the_layers() {
+        let x = random(&[5, WIDTH], 1);
+        for stored in [DType::F32, DType::F16, DType::BF16] {
+            let tensors = file(stored);
+            for (format, lora) in FORMATS.into_iter().flat_map(|f| LORA.map(|l| (f, l))) {
+                let weights = weights(&tensors, format, lora);
+                let joined = JoinedLinear::new(&weights, LAYERS, WIDTH, true).unwrap();
+                let apart = format == WeightFormat::F32 || lora == Some(LoraMode::Apart);
+                assert_eq!(matches!(joined.form, Joined::Apart(_)), apart, "{format} {lora:?}");
+                for (part, (name, outputs)) in joined.forward(&x).unwrap().iter().zip(LAYERS) {
+                    let layer = Linear::new(&weights, name, WIDTH, outputs, true).unwrap();
+                    assert_eq!(part.dims(), [5, outputs]);
+                    let expected = values(&layer.forward(&x).unwrap());
+                    assert_eq!(values(part), expected, "{name} {stored:?} {format} {lora:?}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn the_gated_mlp_is_its_three_layers() {
+        let x = random(&[5, WIDTH], 1);
+        for stored in [DType::F32, DType::F16, DType::BF16] {
+            let tensors = file(stored);
+            for (format, lora) in FORMATS.into_iter().flat_map(|f| LORA.map(|l| (f, l))) {
+                let weights = weights(&tensors, format, lora);
+                let mlp = GatedMlp::new(&weights, "m", WIDTH, 20, true).unwrap();
+                let apart = format == WeightFormat::F32 || lora == Some(LoraMode::Apart);
+                assert_eq!(matches!(mlp.inputs, GateUp::Apart { .. }), apart, "{format} {lora:?}");
+                let layer = |part, x, (inputs, outputs)| {
+                    let name = format!("m.{part}");
+                    Linear::new(&weights, &name, inputs, outputs, true).unwrap().forward(x).unwrap()
+                };
+                let (gate, up) = (layer("gate_proj", &x, (WIDTH, 20)), layer("up_proj", &x, (WIDTH, 20)));
+                let expected = layer("down_proj", &kernels::swiglu(&gate, &up).unwrap(), (20, WIDTH));
+                // The gate's own rounding may tip that of what `down_proj` reads.
+                let tolerance = if format == WeightFormat::F32 { 0.0 } else { 0.05 };
+                for (found, expected) in values(&mlp.forward(&x).unwrap()).iter().zip(values(&expected)) {
+                    let close = (found - expected).abs() <= tolerance * (1.0 + expected.abs());
+                    assert!(close, "{stored:?} {format} {lora:?}: {found}, expected {expected}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn what_joined_layers_lack_is_listed_and_nothing_is_packed() {
+        let mut tensors = file(DType::BF16);
+        for name in ["a.k_proj.weight", "m.up_proj.weight"] {
+            tensors.remove(name);
+        }
+        let weights = weights(&tensors, WeightFormat::Bf16, Some(LoraMode::Merge));
+        let joined = JoinedLinear::new(&weights, LAYERS, WIDTH, true).unwrap();
+        assert!(matches!(joined.form, Joined::Apart(_)));
+        GatedMlp::new(&weights, "m", WIDTH, 20, true).unwrap();
+        match weights.finish() {
+            Err(Error::TensorSet { missing, unexpected, .. }) => {
+                assert_eq!(missing, ["a.k_proj.weight", "m.up_proj.weight"]);
+                assert!(unexpected.is_empty(), "{unexpected:?}");
+            }
+            other => panic!("{other:?}"),
+        }
     }
 }

@@ -1,6 +1,6 @@
 //! A matrix of a checkpoint in the form in which it is kept.
 
-use super::stored::Stored;
+use super::raw::{self, Raw};
 use crate::error::{Error, Result};
 use crate::kernels::{self, PackedWeight, WeightFormat};
 use candle_core::{DType, Device, Tensor};
@@ -16,51 +16,26 @@ pub enum Matrix {
 }
 
 impl Matrix {
-    /// Keeps a f32 tensor, plus `added` of the same shape if given, in a format.
+    /// Keeps a f32 tensor in a format.
     ///
     /// # Errors
-    /// [`Error::Tensors`] if the device refuses it.
-    pub fn from_tensor(tensor: &Tensor, added: Option<&Tensor>, format: WeightFormat) -> Result<Self> {
-        let sum = match added {
-            Some(added) => (tensor + added)?,
-            None => tensor.clone(),
-        };
-        let (rows, columns) = sum.dims2()?;
-        match (format, sum.device()) {
-            (WeightFormat::F32, _) => Ok(Self::Plain(sum)),
-            (_, Device::Cpu) => {
-                let values = sum.flatten_all()?.to_vec1::<f32>()?;
-                Self::packed(&values, rows, columns, format)
-            }
-            _ => Ok(Self::Plain(sum.to_dtype(DType::BF16)?)),
-        }
+    /// [`Error::Tensors`] if it has not two dimensions or the device refuses it; [`Error::Argument`] for what int8 cannot hold.
+    pub fn from_tensor(tensor: &Tensor, format: WeightFormat) -> Result<Self> {
+        tensor.dims2()?;
+        Self::new(&Raw::Tensor(tensor.clone()), format, tensor.device())
     }
 
-    fn packed(values: &[f32], rows: usize, columns: usize, format: WeightFormat) -> Result<Self> {
-        let packed = match format {
-            WeightFormat::Int8 => PackedWeight::int8_from_rows(rows, columns, |i, out| {
-                out.copy_from_slice(&values[i * columns..(i + 1) * columns]);
-            })?,
-            _ => PackedWeight::bf16_from_f32(values, rows, columns)?,
-        };
-        Ok(Self::Packed(Arc::new(packed)))
-    }
-
-    /// Converts a tensor of a file. bf16 is packed as it lies, without a copy in f32.
-    pub(super) fn from_stored(stored: &Stored, format: WeightFormat, device: &Device) -> Result<Self> {
-        let &[rows, columns] = stored.shape() else {
-            let found = format!("shape {:?}", stored.shape());
-            return Err(Error::argument("matrix", found, "two dimensions"));
-        };
-        match (format, device, stored.dtype()) {
-            (WeightFormat::F32, _, _) => Ok(Self::Plain(stored.f32(device)?)),
-            (WeightFormat::Bf16, Device::Cpu, DType::BF16) => {
-                let packed = stored.with_bytes(|b| PackedWeight::bf16_from_bytes(b, rows, columns))??;
-                Ok(Self::Packed(Arc::new(packed)))
-            }
-            (_, Device::Cpu, _) => Self::packed(&stored.values()?, rows, columns, format),
-            _ => Ok(Self::Plain(stored.f32(&Device::Cpu)?.to_dtype(DType::BF16)?.to_device(device)?)),
+    /// Keeps a matrix in a format; what lies in a file goes to `device`. What is absent takes no memory.
+    pub(super) fn new(raw: &Raw<'_>, format: WeightFormat, device: &Device) -> Result<Self> {
+        if raw.packs(format, device) {
+            return Ok(Self::Packed(Arc::new(raw::pack(&[raw], format)?)));
         }
+        Ok(Self::Plain(match (format, raw) {
+            (WeightFormat::F32, _) | (_, Raw::Absent(_)) => raw.f32(device)?,
+            // Half as much goes to the device.
+            (_, Raw::Stored(stored)) => stored.f32(&Device::Cpu)?.to_dtype(DType::BF16)?.to_device(device)?,
+            (_, Raw::Tensor(tensor)) => tensor.to_dtype(DType::BF16)?,
+        }))
     }
 
     /// Output and input width.

@@ -16,6 +16,7 @@ pub mod matrix;
 pub mod patch_embed;
 pub mod preprocess;
 pub mod prompt;
+mod raw;
 pub mod resize;
 pub mod rope;
 pub(crate) mod shards;

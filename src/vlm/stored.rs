@@ -31,20 +31,44 @@ pub(crate) struct Stored {
     range: Range<usize>,
 }
 
-/// Maps a range of a file for the time of one call. Only what is mapped counts as the program's memory, so a checkpoint
-/// is never resident beside the weights that are made from it.
-fn mapped<R>(name: &str, file: &File, range: Option<Range<usize>>, f: impl FnOnce(&[u8]) -> R) -> Result<R> {
-    let mut options = memmap2::MmapOptions::new();
-    if let Some(range) = range {
-        if range.is_empty() {
-            return Ok(f(&[]));
+/// Bytes of a file. Those on disk are mapped as long as this lives: only what is mapped counts as the program's memory, so
+/// that a checkpoint is never resident beside the weights that are made from it.
+pub(super) enum Bytes<'a> {
+    Held(&'a [u8]),
+    Mapped(memmap2::Mmap),
+}
+
+impl std::ops::Deref for Bytes<'_> {
+    type Target = [u8];
+
+    fn deref(&self) -> &[u8] {
+        match self {
+            Bytes::Held(bytes) => bytes,
+            Bytes::Mapped(map) => map,
         }
-        options.offset(range.start as u64).len(range.len());
     }
-    // SAFETY: the map is read-only and lives for this call. That nobody truncates the file meanwhile is the caller's
-    // part, as with any program that maps its weights; a file that is short to begin with is refused when it is opened.
-    let bytes = unsafe { options.map(file) }.map_err(Error::io(Path::new(name)))?;
-    Ok(f(&bytes))
+}
+
+impl Inner {
+    /// All bytes of the file, or a range of them.
+    fn bytes(&self, range: Option<Range<usize>>) -> Result<Bytes<'_>> {
+        let file = match &self.content {
+            Content::Bytes(bytes) => return Ok(Bytes::Held(range.map_or(&bytes[..], |r| &bytes[r]))),
+            Content::Mapped(file) => file,
+        };
+        let mut options = memmap2::MmapOptions::new();
+        if let Some(range) = range {
+            if range.is_empty() {
+                return Ok(Bytes::Held(&[]));
+            }
+            options.offset(range.start as u64).len(range.len());
+        }
+        // SAFETY: the map is read-only and lives no longer than the tensor's conversion. That nobody truncates the file meanwhile is
+        // the caller's part, as with any program that maps its weights; a file that is short to begin with is refused when
+        // it is opened.
+        let map = unsafe { options.map(file) }.map_err(Error::io(Path::new(&self.name)))?;
+        Ok(Bytes::Mapped(map))
+    }
 }
 
 impl StoredFile {
@@ -59,10 +83,7 @@ impl StoredFile {
 
     /// Names and places of all tensors.
     pub(crate) fn tensors(&self) -> Result<Vec<(String, Stored)>> {
-        match &self.0.content {
-            Content::Bytes(bytes) => self.parse(bytes),
-            Content::Mapped(file) => mapped(&self.0.name, file, None, |bytes| self.parse(bytes))?,
-        }
+        self.parse(&self.0.bytes(None)?)
     }
 
     fn parse(&self, bytes: &[u8]) -> Result<Vec<(String, Stored)>> {
@@ -107,23 +128,25 @@ impl Stored {
         self.dtype
     }
 
-    /// Calls `f` with the little-endian bytes.
-    pub(super) fn with_bytes<R>(&self, f: impl FnOnce(&[u8]) -> R) -> Result<R> {
-        match &self.file.content {
-            Content::Bytes(bytes) => Ok(f(&bytes[self.range.clone()])),
-            Content::Mapped(file) => mapped(&self.file.name, file, Some(self.range.clone()), f),
-        }
+    /// Rows and columns.
+    pub(super) fn matrix(&self) -> Result<[usize; 2]> {
+        <[usize; 2]>::try_from(&self.shape[..])
+            .map_err(|_| Error::argument("matrix", format!("shape {:?}", self.shape), "two dimensions"))
+    }
+
+    /// Little-endian values of its type.
+    pub(super) fn bytes(&self) -> Result<Bytes<'_>> {
+        self.file.bytes(Some(self.range.clone()))
     }
 
     /// The values as f32, in one pass.
     pub(super) fn values(&self) -> Result<Vec<f32>> {
-        self.with_bytes(|bytes| widened(bytes, self.dtype))
+        Ok(widened(&self.bytes()?, self.dtype))
     }
 
     /// The tensor on the CPU in the type in which it is stored.
     pub(crate) fn tensor(&self) -> Result<Tensor> {
-        let tensor = |bytes: &[u8]| Tensor::from_raw_buffer(bytes, self.dtype, self.shape(), &Device::Cpu);
-        Ok(self.with_bytes(tensor)??)
+        Ok(Tensor::from_raw_buffer(&self.bytes()?, self.dtype, self.shape(), &Device::Cpu)?)
     }
 
     /// The tensor as f32 on a device.
@@ -163,7 +186,7 @@ mod tests {
             for format in [WeightFormat::F32, WeightFormat::Bf16] {
                 let weights = Weights::from_file(&path, &Device::Cpu).unwrap().with_format(format);
                 assert_eq!(of(weights.get("w", &[2, 3]).unwrap()), values, "{stored:?}");
-                let matrix = weights.matrix("w", [2, 3], None).unwrap();
+                let matrix = weights.matrix("w", [2, 3]).unwrap();
                 assert_eq!(of(matrix.rows(&[0, 1]).unwrap()), values, "{stored:?} as {format:?}");
             }
         }

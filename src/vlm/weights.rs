@@ -2,6 +2,7 @@
 
 use super::lora::LoraSet;
 use super::matrix::Matrix;
+use super::raw::Raw;
 use super::stored::Stored;
 pub(crate) use super::stored::StoredFile;
 use crate::error::{Error, Result};
@@ -230,27 +231,32 @@ impl Weights {
         }
     }
 
-    /// The matrix `[rows, columns]` of this name in the form of [`Weights::with_format`], with `added` (f32, same shape)
-    /// on top if given.
+    /// The matrix `[rows, columns]` of this name in the form of [`Weights::with_format`].
     ///
     /// # Errors
     /// As [`Weights::get`]; what stands in for a matrix takes no memory.
-    pub fn matrix(&self, name: &str, shape: [usize; 2], added: Option<&Tensor>) -> Result<Matrix> {
+    pub fn matrix(&self, name: &str, shape: [usize; 2]) -> Result<Matrix> {
+        Matrix::new(&self.raw(name, shape)?, self.format, &self.device)
+    }
+
+    /// The matrix of this name as it is found.
+    pub(super) fn raw(&self, name: &str, shape: [usize; 2]) -> Result<Raw<'_>> {
         match self.find(name, &shape) {
-            Some(Source::Tensor(t)) => Matrix::from_tensor(&t.to_dtype(DType::F32)?, added, self.format),
-            Some(Source::Stored(s)) => match added {
-                Some(_) => Matrix::from_tensor(&s.f32(&self.device)?, added, self.format),
-                None => Matrix::from_stored(s, self.format, &self.device),
-            },
-            None => {
-                if let Some(made) = self.make(name, &shape)? {
-                    return Matrix::from_tensor(&made, added, self.format);
+            Some(Source::Tensor(t)) => Ok(Raw::Tensor(t.to_dtype(DType::F32)?)),
+            Some(Source::Stored(s)) => Ok(Raw::Stored(s)),
+            None => match self.make(name, &shape)? {
+                Some(made) => Ok(Raw::Tensor(made)),
+                None => {
+                    self.stand_in(name, &shape, false)?;
+                    Ok(Raw::Absent(shape))
                 }
-                self.stand_in(name, &shape, false)?;
-                let zero = Tensor::zeros((1, 1), DType::F32, &Device::Cpu)?;
-                Ok(Matrix::Plain(zero.broadcast_as(&shape)?))
-            }
+            },
         }
+    }
+
+    /// Where tensors lie.
+    pub(super) fn device(&self) -> &Device {
+        &self.device
     }
 
     fn make(&self, name: &str, shape: &[usize]) -> Result<Option<Tensor>> {

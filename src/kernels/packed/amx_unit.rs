@@ -2,7 +2,7 @@
 
 use super::amx::Unit;
 use super::isa::Kernel;
-use super::{PackedWeight, WeightFormat};
+use super::{PackedWeight, Rows, WeightFormat};
 use crate::error::Result;
 use std::arch::asm;
 use std::sync::OnceLock;
@@ -174,12 +174,7 @@ fn agrees() -> Result<bool> {
     let wave = |count: usize, by: f32| -> Vec<f32> { (0..count).map(|i| (i as f32 * by).sin()).collect() };
     let (x, w) = (wave(n * k, 0.37), wave(m * k, 0.23));
     for format in [WeightFormat::Bf16, WeightFormat::Int8] {
-        let weight = match format {
-            WeightFormat::Int8 => PackedWeight::int8_from_rows(m, k, |row, out| {
-                out.copy_from_slice(&w[row * k..(row + 1) * k])
-            })?,
-            _ => PackedWeight::bf16_from_f32(&w, m, k)?,
-        };
+        let weight = PackedWeight::new(format, &[Rows::f32(&w, m, k)?])?;
         let by = |kernel: Kernel| weight.product(kernel, &x, n, m, weight.finish(None));
         let (found, expected) = (by(Kernel::amx(format)), by(Kernel::portable(format)));
         if found.iter().zip(&expected).any(|(f, e)| (f - e).abs() > 1e-3) {

@@ -3,7 +3,7 @@
 use super::gemm::Finish;
 use super::isa::Kernel;
 use super::panel::{HALF, WIDTH};
-use super::{PackedWeight, WeightFormat, expect_cpu_f32};
+use super::{PackedWeight, Rows, WeightFormat, expect_cpu_f32, rows};
 use crate::error::{Error, Result};
 use crate::kernels::exec::{dims2, expect_dims, read, tensor};
 use candle_core::Tensor;
@@ -19,31 +19,30 @@ pub struct PackedGate {
 }
 
 impl PackedGate {
-    /// Joins two weights `[m, k]` of one format, each with its bias `[m]` (f32 on the CPU) or none. The result holds copies: both weights may
-    /// be dropped.
+    /// Packs two weights `[m, k]`, each with its bias `[m]` (f32 on the CPU) or none.
     ///
     /// # Errors
-    /// [`Error::Argument`] where sizes, formats, types or devices do not fit.
-    pub fn new(gate: (&PackedWeight, Option<&Tensor>), up: (&PackedWeight, Option<&Tensor>)) -> Result<Self> {
-        let ((gate, gate_bias), (up, up_bias)) = (gate, up);
-        if (gate.dims(), gate.format) != (up.dims(), up.format) {
-            let found = format!("{:?} of {:?}", up.format, up.dims());
-            let expected = format!("{:?} of {:?} as the gate", gate.format, gate.dims());
-            return Err(Error::argument("up projection", found, expected));
+    /// [`Error::Argument`] where sizes, types or devices do not fit; as [`PackedWeight::new`].
+    pub fn new(
+        format: WeightFormat,
+        (gate, gate_bias): (Rows<'_>, Option<&Tensor>),
+        (up, up_bias): (Rows<'_>, Option<&Tensor>),
+    ) -> Result<Self> {
+        let (outputs, k) = gate.dims();
+        if up.dims() != (outputs, k) {
+            let expected = format!("{:?} as the gate", gate.dims());
+            return Err(Error::argument("up projection", format!("{:?}", up.dims()), expected));
         }
-        let (outputs, _) = gate.dims();
         let bias = match (gate_bias, up_bias) {
             (None, None) => None,
             (gate, up) => Some(alternate(&values(gate, outputs)?, &values(up, outputs)?)),
         };
-        let (scales, offsets) = match gate.format {
-            WeightFormat::Int8 => {
-                (alternate(&gate.scales, &up.scales), alternate(&gate.offsets, &up.offsets))
-            }
-            _ => (Vec::new(), Vec::new()),
-        };
-        let panels = gate.panels.interleave(&up.panels);
-        Ok(PackedGate { both: PackedWeight { panels, format: gate.format, scales, offsets }, bias, outputs })
+        let channels = outputs.div_ceil(HALF) * WIDTH;
+        let both = rows::pack(format, &[gate, up], (channels, k), |channel| {
+            let row = channel / WIDTH * HALF + channel % HALF;
+            (row < outputs).then_some((channel % WIDTH / HALF, row))
+        })?;
+        Ok(PackedGate { both, bias, outputs })
     }
 
     /// Outputs and inputs `(m, k)`.
@@ -88,9 +87,9 @@ fn values(bias: Option<&Tensor>, m: usize) -> Result<Vec<f32>> {
     Ok(read(bias, |bias| Ok(bias.to_vec()))?)
 }
 
-/// Channels in the order of the joined panels, with defaults where there is none.
-fn alternate<T: Copy + Default>(gate: &[T], up: &[T]) -> Vec<T> {
-    let mut both = vec![T::default(); gate.len().div_ceil(HALF) * WIDTH];
+/// Values of the channels in the order of the panels, zeros where there is none.
+fn alternate(gate: &[f32], up: &[f32]) -> Vec<f32> {
+    let mut both = vec![0.0; gate.len().div_ceil(HALF) * WIDTH];
     for (both, (gate, up)) in both.chunks_exact_mut(WIDTH).zip(gate.chunks(HALF).zip(up.chunks(HALF))) {
         both[..gate.len()].copy_from_slice(gate);
         both[HALF..HALF + up.len()].copy_from_slice(up);
@@ -101,18 +100,8 @@ fn alternate<T: Copy + Default>(gate: &[T], up: &[T]) -> Vec<T> {
 #[cfg(test)]
 mod tests {
     use super::super::super::testing::{random, same_on_any_thread_count, values};
-    use super::super::tests::{SHAPES, every_kernel};
+    use super::super::tests::{SHAPES, every_kernel, packed_as};
     use super::*;
-
-    fn pack(w: &[f32], m: usize, k: usize, format: WeightFormat) -> PackedWeight {
-        match format {
-            WeightFormat::Int8 => {
-                PackedWeight::int8_from_rows(m, k, |i, out| out.copy_from_slice(&w[i * k..(i + 1) * k]))
-            }
-            _ => PackedWeight::bf16_from_f32(w, m, k),
-        }
-        .unwrap()
-    }
 
     #[test]
     fn it_is_the_two_products_and_their_gate() {
@@ -120,12 +109,14 @@ mod tests {
             [WeightFormat::Bf16, WeightFormat::Int8].into_iter().flat_map(|f| SHAPES.map(|s| (f, s)))
         {
             let x = random(&[n, k], 1);
-            let weight = |seed| pack(&values(&random(&[m, k], seed)), m, k, format);
-            let (gate, up, gate_bias, up_bias) = (weight(2), weight(3), random(&[m], 4), random(&[m], 5));
+            let [gate, up] = [2, 3].map(|seed| values(&random(&[m, k], seed)));
+            let [gate_rows, up_rows] = [&gate, &up].map(|w| Rows::f32(w, m, k).unwrap());
+            let [gate, up] = [&gate, &up].map(|w| packed_as(format, w, m, k));
+            let (gate_bias, up_bias) = (random(&[m], 4), random(&[m], 5));
             for (gate_bias, up_bias) in
                 [(None, None), (Some(&gate_bias), Some(&up_bias)), (Some(&gate_bias), None)]
             {
-                let both = PackedGate::new((&gate, gate_bias), (&up, up_bias)).unwrap();
+                let both = PackedGate::new(format, (gate_rows, gate_bias), (up_rows, up_bias)).unwrap();
                 assert_eq!((both.dims(), both.format()), ((m, k), format));
                 for kernel in every_kernel(format) {
                     let found = values(&both.apply_by(kernel, &x).unwrap());
@@ -144,16 +135,16 @@ mod tests {
 
     #[test]
     fn threads_do_not_matter_and_misfits_are_errors() {
-        let weight = |m, k| pack(&values(&random(&[m, k], 2)), m, k, WeightFormat::Bf16);
-        let both = PackedGate::new((&weight(300, 40), None), (&weight(300, 40), None)).unwrap();
+        let w = values(&random(&[301, 40], 2));
+        let rows = |m: usize| Rows::f32(&w[..m * 40], m, 40).unwrap();
+        let gate = |up, bias| PackedGate::new(WeightFormat::Bf16, (rows(300), None), (up, bias));
+        let both = gate(rows(300), None).unwrap();
         let x = random(&[250, 40], 1);
         same_on_any_thread_count(|| vec![both.apply(&x).unwrap()]);
         assert!(both.bytes() >= 2 * 2 * 300 * 40);
         assert!(both.apply(&random(&[2, 41], 1)).is_err());
-        let (gate, bias) = (weight(300, 40), random(&[299], 1));
-        assert!(PackedGate::new((&gate, None), (&weight(301, 40), None)).is_err());
-        assert!(PackedGate::new((&gate, None), (&gate, Some(&bias))).is_err());
-        let bytes = pack(&vec![1.0; 300 * 40], 300, 40, WeightFormat::Int8);
-        assert!(PackedGate::new((&gate, None), (&bytes, None)).is_err());
+        assert!(gate(rows(301), None).is_err());
+        assert!(gate(rows(300), Some(&random(&[299], 1))).is_err());
+        assert!(PackedGate::new(WeightFormat::F32, (rows(300), None), (rows(300), None)).is_err());
     }
 }

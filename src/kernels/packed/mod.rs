@@ -20,6 +20,7 @@ mod isa;
 mod lhs;
 mod panel;
 mod quantise;
+mod rows;
 #[cfg(test)]
 mod tests;
 #[cfg(test)]
@@ -38,6 +39,7 @@ use gemm::{Channels, Finish, Job};
 use isa::Kernel;
 use lhs::Left;
 use panel::Panels;
+pub use rows::Rows;
 
 #[cfg(target_arch = "x86_64")]
 pub(super) use amx_unit::usable as amx_usable;
@@ -58,63 +60,32 @@ pub struct PackedWeight {
     offsets: Vec<i32>,
 }
 
-/// Largest inner dimension of bytes: the sum of so many products of 255 and 127 is below 2^31.
-const LONGEST_INT8: usize = 1 << 16;
-
 impl PackedWeight {
-    /// Packs `m * k` little-endian bf16 values, row-major, as a safetensors file holds them; any alignment.
+    /// Packs weights that have the same inputs as one, whose outputs are theirs in turn.
+    ///
+    /// bf16: values are rounded to nearest, ties to even. int8: each output channel becomes bytes in -127 ..= 127 times its own scale,
+    /// its largest magnitude over 127.
     ///
     /// # Errors
-    /// [`Error::BufferLength`] where `bytes` is not `2 * m * k` bytes long.
-    pub fn bf16_from_bytes(bytes: &[u8], m: usize, k: usize) -> Result<Self> {
-        let values = elements(bytes.len() / 2, m, k)?;
-        if bytes.len() != 2 * values {
-            let (expected, found) = (2 * values, bytes.len());
-            return Err(Error::BufferLength { what: "bf16 weight, in bytes", expected, found });
+    /// [`Error::Argument`] where the inputs differ, the format is [`WeightFormat::F32`], or it is [`WeightFormat::Int8`] and a
+    /// value is not finite or the inputs are more than 65,536.
+    pub fn new(format: WeightFormat, parts: &[Rows<'_>]) -> Result<Self> {
+        let k = parts.first().map_or(0, |part| part.dims().1);
+        if let Some((_, other)) = parts.iter().map(Rows::dims).find(|dims| dims.1 != k) {
+            return Err(Error::argument("inputs of joined weights", other, format!("{k} for all of them")));
         }
-        let (panels, _) = Panels::build(m, k, 2, |row, words| {
-            words::from_bf16_bytes(&bytes[row * 2 * k..(row + 1) * 2 * k], words);
-        });
-        Ok(PackedWeight::bf16(panels))
-    }
-
-    /// Rounds `m * k` row-major values to bf16 (to nearest, ties to even) and packs them.
-    ///
-    /// # Errors
-    /// [`Error::BufferLength`] where `values` does not hold `m * k` elements.
-    pub fn bf16_from_f32(values: &[f32], m: usize, k: usize) -> Result<Self> {
-        elements(values.len(), m, k)?;
-        let (panels, _) = Panels::build(m, k, 2, |row, words| {
-            words::from_f32(&values[row * k..(row + 1) * k], words);
-        });
-        Ok(PackedWeight::bf16(panels))
-    }
-
-    fn bf16(panels: Panels) -> Self {
-        PackedWeight { panels, format: WeightFormat::Bf16, scales: Vec::new(), offsets: Vec::new() }
-    }
-
-    /// Quantises the rows that `row(index, values)` writes: each output channel to bytes in -127 ..= 127 times its own scale, its
-    /// largest magnitude over 127. Rows are asked for once each, in any order, from several threads.
-    ///
-    /// # Errors
-    /// [`Error::Argument`] for a value that is not finite, or `k` above 65,536.
-    pub fn int8_from_rows(m: usize, k: usize, row: impl Fn(usize, &mut [f32]) + Sync) -> Result<Self> {
-        if k > LONGEST_INT8 {
-            return Err(Error::argument("inputs of an int8 weight", k, format!("at most {LONGEST_INT8}")));
-        }
-        let (panels, channels) = Panels::build(m, k, 4, |index, words| {
-            let mut values = vec![0f32; k];
-            row(index, &mut values);
-            quantise::weight_row(&values, words)
-        });
-        if let Some(bad) = channels.iter().position(|(scale, _)| scale.is_nan()) {
-            let found = format!("a value in row {bad} that is not finite");
-            return Err(Error::argument("int8 weight", found, "finite values"));
-        }
-        let (scales, offsets) =
-            channels.into_iter().map(|(scale, sum)| (scale, quantise::ZERO * sum)).unzip();
-        Ok(PackedWeight { panels, format: WeightFormat::Int8, scales, offsets })
+        let m = parts.iter().map(|part| part.dims().0).sum();
+        rows::pack(format, parts, (m, k), |channel| {
+            let mut row = channel;
+            parts.iter().enumerate().find_map(|(i, part)| {
+                let (m, _) = part.dims();
+                if row < m {
+                    return Some((i, row));
+                }
+                row -= m;
+                None
+            })
+        })
     }
 
     /// Outputs and inputs `(m, k)`.
@@ -211,17 +182,6 @@ fn spread<const N: usize>(out: &mut [f32], words: impl Iterator<Item = [f32; N]>
     for (out, word) in out.chunks_mut(N).zip(words) {
         for (o, value) in out.iter_mut().zip(word) {
             *o = value;
-        }
-    }
-}
-
-/// `m * k`, which must be `found`.
-fn elements(found: usize, m: usize, k: usize) -> Result<usize> {
-    match m.checked_mul(k) {
-        Some(expected) if expected == found => Ok(expected),
-        expected => {
-            let expected = expected.unwrap_or(usize::MAX);
-            Err(Error::BufferLength { what: "packed weight", expected, found })
         }
     }
 }

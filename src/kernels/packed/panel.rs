@@ -96,23 +96,6 @@ impl Panels {
         (Panels { words, m, k, steps }, results.into_iter().flatten().collect())
     }
 
-    /// Panels of two weights of the same size, each of 16 channels of `self` and the same 16 of `other`.
-    pub(super) fn interleave(&self, other: &Panels) -> Panels {
-        let (steps, m) = (self.steps, self.m.div_ceil(HALF) * WIDTH);
-        let mut words = Words::zeros(m * steps);
-        let fill = |(p, panel): (usize, &mut [u32])| {
-            let at = p / 2 * WIDTH * steps + p % 2 * HALF;
-            for (step, out) in panel.chunks_exact_mut(WIDTH).enumerate() {
-                let at = at + step * WIDTH;
-                let (first, second) = out.split_at_mut(HALF);
-                first.copy_from_slice(&self.words()[at..at + HALF]);
-                second.copy_from_slice(&other.words()[at..at + HALF]);
-            }
-        };
-        words.get_mut().par_chunks_exact_mut((WIDTH * steps).max(1)).enumerate().for_each(fill);
-        Panels { words, m, k: self.k, steps }
-    }
-
     /// All panels.
     pub(super) fn words(&self) -> &[u32] {
         self.words.get()

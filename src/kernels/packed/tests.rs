@@ -25,6 +25,10 @@ pub(super) fn matrix(values: Vec<f32>, n: usize, k: usize) -> Tensor {
     Tensor::from_vec(values, (n, k), &Device::Cpu).unwrap()
 }
 
+pub(super) fn packed_as(format: WeightFormat, w: &[f32], m: usize, k: usize) -> PackedWeight {
+    PackedWeight::new(format, &[Rows::f32(w, m, k).unwrap()]).unwrap()
+}
+
 /// Inner dimensions, outputs and rows about every edge: of a word, a register, a panel, a block of steps.
 pub(super) const SHAPES: [(usize, usize, usize); 14] = [
     (1, 1, 1),
@@ -48,7 +52,7 @@ fn bf16_products_are_those_of_f64() {
     for (n, k, m) in SHAPES {
         let (x, w, bias) = (random(&[n, k], 1), random(&[m, k], 2), random(&[m], 3));
         let (xs, ws, bs) = (rounded(&values(&x)), rounded(&values(&w)), values(&bias));
-        let packed = PackedWeight::bf16_from_f32(&values(&w), m, k).unwrap();
+        let packed = packed_as(WeightFormat::Bf16, &values(&w), m, k);
         assert_eq!((packed.dims(), packed.format()), ((m, k), WeightFormat::Bf16));
         for kernel in every_kernel(WeightFormat::Bf16) {
             let plain = values(&packed.linear_by(kernel, &x, None).unwrap());
@@ -73,7 +77,7 @@ fn bf16_products_are_those_of_f64() {
 fn a_row_does_not_depend_on_the_others() {
     let (n, k, m) = (29, 2100, 70);
     let x = random(&[n, k], 1);
-    let packed = PackedWeight::bf16_from_f32(&values(&random(&[m, k], 2)), m, k).unwrap();
+    let packed = packed_as(WeightFormat::Bf16, &values(&random(&[m, k], 2)), m, k);
     for kernel in every_kernel(WeightFormat::Bf16) {
         let all = packed.linear_by(kernel, &x, None).unwrap();
         for (from, count) in [(0, 1), (28, 1), (3, 2), (5, 4), (7, 13)] {
@@ -90,7 +94,7 @@ fn not_a_number_and_infinities_reach_their_row_only() {
     x[k + 8] = f32::NAN;
     x[2 * k] = f32::INFINITY;
     x[3 * k + 1] = f32::NEG_INFINITY;
-    let packed = PackedWeight::bf16_from_f32(&vec![0.5; m * k], m, k).unwrap();
+    let packed = packed_as(WeightFormat::Bf16, &vec![0.5; m * k], m, k);
     for kernel in every_kernel(WeightFormat::Bf16) {
         let out = packed.linear_by(kernel, &matrix(x.clone(), n, k), None).unwrap();
         let expected = [4.5, f32::NAN, f32::INFINITY, f32::NEG_INFINITY, 4.5];
@@ -104,7 +108,7 @@ fn not_a_number_and_infinities_reach_their_row_only() {
 fn every_element_is_written() {
     for (n, k, m) in SHAPES {
         let (x, w) = (values(&random(&[n, k], 1)), values(&random(&[m, k], 2)));
-        let packed = PackedWeight::bf16_from_f32(&w, m, k).unwrap();
+        let packed = packed_as(WeightFormat::Bf16, &w, m, k);
         for kernel in every_kernel(WeightFormat::Bf16) {
             let left = Left::new(kernel, &x, n, k);
             let mut out = vec![MaybeUninit::new(f32::NAN); n * m];
@@ -120,7 +124,7 @@ fn every_element_is_written() {
 #[test]
 fn threads_do_not_matter() {
     let x = random(&[250, 70], 1);
-    let packed = PackedWeight::bf16_from_f32(&values(&random(&[600, 70], 2)), 600, 70).unwrap();
+    let packed = packed_as(WeightFormat::Bf16, &values(&random(&[600, 70], 2)), 600, 70);
     same_on_any_thread_count(|| vec![packed.linear(&x, None).unwrap()]);
 }
 
@@ -131,7 +135,8 @@ fn rows_come_back_as_they_went_in() {
         let bytes: Vec<u8> = weight.iter().flat_map(|v| half::bf16::from_f32(*v).to_le_bytes()).collect();
         // An odd address, as a memory map may give.
         let moved = [vec![0], bytes].concat();
-        let packed = PackedWeight::bf16_from_bytes(&moved[1..], m, k).unwrap();
+        let stored = Rows::bf16(&moved[1..], m, k).unwrap();
+        let packed = PackedWeight::new(WeightFormat::Bf16, &[stored]).unwrap();
         let ids: Vec<u32> = (0..m as u32).rev().chain([0]).collect();
         let rows = packed.rows(&ids).unwrap();
         assert_eq!(rows.dims(), [m + 1, k]);
@@ -141,17 +146,13 @@ fn rows_come_back_as_they_went_in() {
         assert!(packed.bytes() >= 2 * m * k);
         assert!(packed.rows(&[m as u32]).is_err());
     }
-    let empty = PackedWeight::bf16_from_f32(&[], 3, 0).unwrap();
+    let empty = packed_as(WeightFormat::Bf16, &[], 3, 0);
     assert_eq!(empty.rows(&[2, 1]).unwrap().dims(), [2, 0]);
 }
 
 #[test]
 fn what_does_not_fit_is_an_error() {
-    assert!(PackedWeight::bf16_from_bytes(&[0; 11], 2, 3).is_err());
-    assert!(PackedWeight::bf16_from_bytes(&[0; 13], 2, 3).is_err());
-    assert!(PackedWeight::bf16_from_f32(&[0.0; 5], 2, 3).is_err());
-    assert!(PackedWeight::bf16_from_f32(&[0.0; 5], usize::MAX, 3).is_err());
-    let packed = PackedWeight::bf16_from_f32(&[0.0; 6], 2, 3).unwrap();
+    let packed = packed_as(WeightFormat::Bf16, &[0.0; 6], 2, 3);
     assert!(packed.linear(&random(&[2, 2], 1), None).is_err());
     assert!(packed.linear(&random(&[2, 3, 1], 1), None).is_err());
     assert!(packed.linear(&random(&[2, 3], 1), Some(&random(&[3], 1))).is_err());

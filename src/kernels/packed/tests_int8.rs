@@ -1,11 +1,12 @@
 //! The int8 format over every kernel that this machine can run.
 
 use super::super::testing::{random, same_on_any_thread_count, values};
-use super::tests::{SHAPES, every_kernel, matrix};
+use super::rows::LONGEST_INT8;
+use super::tests::{SHAPES, every_kernel, matrix, packed_as};
 use super::*;
 
 fn packed(w: &[f32], m: usize, k: usize) -> PackedWeight {
-    PackedWeight::int8_from_rows(m, k, |i, out| out.copy_from_slice(&w[i * k..(i + 1) * k])).unwrap()
+    packed_as(WeightFormat::Int8, w, m, k)
 }
 
 /// Plain loops: quantise both sides, sum exactly.
@@ -51,7 +52,6 @@ fn the_largest_sums_do_not_overflow() {
         let out = weight.linear_by(kernel, &matrix(vec![1.0; k], 1, k), None).unwrap();
         assert_eq!(values(&out), [-(k as f32); 2], "{}", kernel.name);
     }
-    assert!(PackedWeight::int8_from_rows(1, k + 1, |_, _| ()).is_err());
 }
 
 #[test]
@@ -67,8 +67,6 @@ fn what_is_not_finite_spoils_its_row_only() {
             assert!(row.iter().all(|v| if i % 3 == 0 { (v - 35.0).abs() < 1e-4 } else { v.is_nan() }));
         }
     }
-    let bad = PackedWeight::int8_from_rows(2, 3, |i, out| out.fill([1.0, f32::NAN][i]));
-    assert!(bad.unwrap_err().to_string().contains("row 1"));
 }
 
 #[test]
