@@ -9,7 +9,7 @@ mod shapes;
 
 use candle_core::{Device, Tensor};
 use criterion::{BenchmarkId, Criterion, SamplingMode, Throughput, criterion_group, criterion_main};
-use sdim::kernels::{PackedGate, swiglu};
+use sdim::kernels::{PackedGate, Rows, swiglu};
 use sdim::vlm::config::VlmConfig;
 use sdim::vlm::matrix::Matrix;
 use sdim::{Result, WeightFormat};
@@ -44,11 +44,13 @@ enum Weight {
 
 impl Weight {
     fn new((k, m, gated): Shape, format: WeightFormat) -> Result<Self> {
-        Ok(match (gated, Matrix::from_tensor(&values("weight", m, k), None, format)?) {
-            (false, one) => Self::Plain(one),
-            (true, Matrix::Packed(one)) => Self::Gate(PackedGate::new((&one, None), (&one, None))?),
-            (true, one) => Self::Pair(one),
-        })
+        if gated && format != WeightFormat::F32 {
+            let values = shapes::random("weight", &[m, k]);
+            let rows = Rows::f32(&values, m, k)?;
+            return Ok(Self::Gate(PackedGate::new(format, (rows, None), (rows, None))?));
+        }
+        let one = Matrix::from_tensor(&values("weight", m, k), format)?;
+        Ok(if gated { Self::Pair(one) } else { Self::Plain(one) })
     }
 
     fn apply(&self, x: &Tensor) -> Result<Tensor> {
