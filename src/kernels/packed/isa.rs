@@ -80,12 +80,12 @@ mod x86 {
         "avx512f,avx512vl,avx512dq,avx512bw,avx2,fma"
     );
     kernel!(BF16_AMX = "amx", 2, 1, lhs::pairs, Tiles<amx_unit::Tiles, false>, "avx512f,avx512vl,avx512dq,avx512bw,avx2,fma");
-    kernel!(INT8_AMX = "amx", 4, 1, quantise::unsigned_bytes, Tiles<amx_unit::Tiles, true>, "avx512f,avx512vl,avx512dq,avx512bw,avx2,fma");
+    kernel!(INT8_AMX = "amx", 4, 1, quantise::unsigned_bytes_at_once, Tiles<amx_unit::Tiles, true>, "avx512f,avx512vl,avx512dq,avx512bw,avx2,fma");
     kernel!(
         INT8_AVX512_VNNI = "avx512-vnni",
         4,
         1,
-        quantise::unsigned_bytes,
+        quantise::unsigned_bytes_at_once,
         Vnni512,
         "avx512vnni,avx512f,avx512vl,avx512dq,avx512bw,avx2,fma"
     );

@@ -21,7 +21,12 @@ pub(super) fn scale(values: &[f32]) -> (f32, f32) {
         }
     }
     let bits = rest.iter().map(|v| v.to_bits() & 0x7fff_ffff).chain(largest).max().unwrap_or(0);
-    let largest = f32::from_bits(bits);
+    scale_of(f32::from_bits(bits))
+}
+
+/// [`scale`] by the largest magnitude.
+#[inline(always)]
+fn scale_of(largest: f32) -> (f32, f32) {
     if !largest.is_finite() {
         return (f32::NAN, 0.0);
     }
@@ -60,6 +65,13 @@ pub(super) fn bytes(word: u32) -> [f32; 4] {
 #[inline(always)]
 pub(super) fn unsigned_bytes(words: &mut [u32], values: &[f32]) -> f32 {
     let (scale, by) = scale(values);
+    unsigned_bytes_by(words, values, by);
+    scale
+}
+
+/// The bytes of values that are multiplied by `by` first.
+#[inline(always)]
+fn unsigned_bytes_by(words: &mut [u32], values: &[f32], by: f32) {
     // By way of arrays of bytes, which the compiler narrows whole registers to.
     for (words, values) in words.chunks_mut(16).zip(values.chunks(64)) {
         let mut bytes = [0u8; 64];
@@ -76,7 +88,49 @@ pub(super) fn unsigned_bytes(words: &mut [u32], values: &[f32]) -> f32 {
             *word = u32::from_le_bytes(*bytes);
         }
     }
-    scale
+}
+
+/// [`unsigned_bytes`] by AVX-512, the same bytes: its conversion to integers rounds to nearest even too.
+///
+/// # Safety
+/// The CPU must have AVX-512 (F and BW).
+#[cfg(target_arch = "x86_64")]
+#[inline(always)]
+pub(super) unsafe fn unsigned_bytes_at_once(words: &mut [u32], values: &[f32]) -> f32 {
+    use std::arch::x86_64::*;
+    let (whole, rest) = values.as_chunks::<64>();
+    let (first, last) = words.split_at_mut(whole.len() * 16);
+    // SAFETY: the caller's promise for the CPU; 64 values become 16 words, and less than 64 are read under a mask.
+    unsafe {
+        let magnitude = |from: *const f32, mask: __mmask16| {
+            let bits = _mm512_maskz_loadu_epi32(mask, from.cast());
+            _mm512_and_si512(bits, _mm512_set1_epi32(0x7fff_ffff))
+        };
+        let mut largest = [_mm512_setzero_si512(); 4];
+        for values in whole {
+            for (i, largest) in largest.iter_mut().enumerate() {
+                *largest = _mm512_max_epu32(*largest, magnitude(values.as_ptr().add(16 * i), !0));
+            }
+        }
+        for values in rest.chunks(16) {
+            let mask = (1u32 << values.len()).wrapping_sub(1) as __mmask16;
+            largest[0] = _mm512_max_epu32(largest[0], magnitude(values.as_ptr(), mask));
+        }
+        let [a, b, c, d] = largest;
+        let largest = _mm512_max_epu32(_mm512_max_epu32(a, b), _mm512_max_epu32(c, d));
+        let (scale, by) = scale_of(f32::from_bits(_mm512_reduce_max_epu32(largest)));
+        let (factor, zero) = (_mm512_set1_ps(by), _mm_set1_epi8(ZERO as u8 as i8));
+        for (words, values) in first.as_chunks_mut::<16>().0.iter_mut().zip(whole) {
+            for i in 0..4 {
+                let values = _mm512_mul_ps(_mm512_loadu_ps(values.as_ptr().add(16 * i)), factor);
+                // 128 more, modulo 256, is the other upper bit.
+                let bytes = _mm_xor_si128(_mm512_cvtepi32_epi8(_mm512_cvtps_epi32(values)), zero);
+                _mm_storeu_si128(words.as_mut_ptr().add(4 * i).cast(), bytes);
+            }
+        }
+        unsigned_bytes_by(last, rest, by);
+        scale
+    }
 }
 
 /// `value * by` to the nearest integer, 128 being zero.
@@ -130,6 +184,32 @@ mod tests {
                 assert_eq!(byte, pairs[i / 4 * 2 + i % 2] >> (8 * (i & 2)) & 0xff);
                 let value = if i < n { values[i] } else { continue };
                 assert!(((byte as i32 - ZERO) as f32 * scale - value).abs() <= 0.5001 * scale);
+            }
+        }
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    #[test]
+    fn avx512_gives_the_same_bytes() {
+        if !is_x86_feature_detected!("avx512bw") {
+            return;
+        }
+        for n in (0..70usize).chain([128, 200, 1000]) {
+            // Halves among them: ties.
+            let values: Vec<f32> = (0..n).map(|i| (i * 37 % 255) as f32 / 2.0 - 63.5).collect();
+            let (mut plain, mut fast) = (vec![7u32; n.div_ceil(4)], vec![9u32; n.div_ceil(4)]);
+            let scale = unsigned_bytes(&mut plain, &values);
+            // SAFETY: the CPU has AVX-512, as was seen above.
+            assert_eq!(scale.to_bits(), unsafe { unsigned_bytes_at_once(&mut fast, &values) }.to_bits());
+            assert_eq!(plain, fast, "{n}");
+        }
+        for bad in [f32::NAN, f32::INFINITY] {
+            let mut values = vec![1f32; 150];
+            for at in [3, 140] {
+                values[at] = bad;
+                // SAFETY: as above.
+                assert!(unsafe { unsigned_bytes_at_once(&mut [0; 38], &values) }.is_nan());
+                values[at] = 1.0;
             }
         }
     }
