@@ -4,7 +4,7 @@
 
 use super::cache::KvCache;
 use super::config::TextConfig;
-use super::linear::{GatedMlp, Linear, RmsNorm};
+use super::linear::{GatedMlp, JoinedLinear, Linear, RmsNorm};
 use super::matrix::Matrix;
 use super::rope::{MRope, RopeLayout, RopeTable};
 use super::weights::Weights;
@@ -14,9 +14,8 @@ use candle_core::Tensor;
 
 struct DecoderLayer {
     input_layernorm: RmsNorm,
-    q_proj: Linear,
-    k_proj: Linear,
-    v_proj: Linear,
+    /// `k_proj`, `v_proj` and `q_proj`.
+    kvq_proj: JoinedLinear<3>,
     o_proj: Linear,
     post_attention_layernorm: RmsNorm,
     mlp: GatedMlp,
@@ -39,16 +38,14 @@ impl DecoderLayer {
     fn new(c: &TextConfig, weights: &Weights, index: usize) -> Result<Self> {
         let (d, kv) = (c.hidden_size, c.kv_heads * c.head_dim());
         let name = format!("model.layers.{index}");
-        let attn = |part: &str, outputs, bias| {
-            Linear::new(weights, &format!("{name}.self_attn.{part}"), d, outputs, bias)
-        };
+        let attn = |part: &str| format!("{name}.self_attn.{part}");
+        let [k_proj, v_proj, q_proj] = ["k_proj", "v_proj", "q_proj"].map(attn);
+        let kvq = [(&*k_proj, kv), (&*v_proj, kv), (&*q_proj, d)];
         let norm = |part: &str| RmsNorm::new(weights, &format!("{name}.{part}"), d, c.rms_norm_eps);
         Ok(Self {
             input_layernorm: norm("input_layernorm")?,
-            q_proj: attn("q_proj", d, true)?,
-            k_proj: attn("k_proj", kv, true)?,
-            v_proj: attn("v_proj", kv, true)?,
-            o_proj: attn("o_proj", d, false)?,
+            kvq_proj: JoinedLinear::new(weights, kvq, d, true)?,
+            o_proj: Linear::new(weights, &attn("o_proj"), d, d, false)?,
             post_attention_layernorm: norm("post_attention_layernorm")?,
             mlp: GatedMlp::new(weights, &format!("{name}.mlp"), d, c.intermediate_size, false)?,
         })
@@ -65,26 +62,60 @@ impl DecoderLayer {
         context: &mut Context,
     ) -> Result<Tensor> {
         let normed = self.input_layernorm.forward(x)?;
-        let k = kernels::rope(&self.k_proj.forward(&normed)?, &table.cos, &table.sin, layout.kv_heads)?;
-        let v = self.v_proj.forward(&normed)?;
-        let (k, v, shared) = match context {
-            Context::Packed(_) => (k, v, None),
+        let Some(kept) = kept else {
+            let [k, v, q] = self.kvq_proj.forward(&normed)?;
+            let keys = Keys::new(k, v, table, layout, index, context)?;
+            return self.rest(x, &q, &keys, table, layout);
+        };
+        let [k, v] = self.kvq_proj.first(&normed)?;
+        let keys = Keys::new(k, v, table, layout, index, context)?;
+        let Kept::Rows { rows, table, layout } = kept else { return Ok(x.narrow(0, 0, 0)?) };
+        // Keys and values come along for few rows.
+        let [_, _, q] = self.kvq_proj.forward(&normed.index_select(rows, 0)?)?;
+        self.rest(&x.index_select(rows, 0)?, &q, &keys, table, layout)
+    }
+
+    /// From the queries on.
+    fn rest(
+        &self,
+        x: &Tensor,
+        q: &Tensor,
+        keys: &Keys,
+        table: &RopeTable,
+        layout: &AttentionLayout,
+    ) -> Result<Tensor> {
+        let q = kernels::rope(q, &table.cos, &table.sin, layout.heads)?;
+        let x =
+            self.o_proj.forward_onto(&kernels::attention(&q, &keys.k, &keys.v, keys.shared, layout)?, x)?;
+        self.mlp.forward_onto(&self.post_attention_layernorm.forward(&x)?, &x)
+    }
+}
+
+/// Keys and values that the queries of a pass see.
+struct Keys<'a> {
+    k: Tensor,
+    v: Tensor,
+    shared: Option<(&'a Tensor, &'a Tensor)>,
+}
+
+impl<'a> Keys<'a> {
+    /// Turns the pass's own keys by their positions and puts them to those of its context.
+    fn new(
+        k: Tensor,
+        v: Tensor,
+        table: &RopeTable,
+        layout: &AttentionLayout,
+        index: usize,
+        context: &mut Context<'a>,
+    ) -> Result<Self> {
+        let k = kernels::rope(&k, &table.cos, &table.sin, layout.kv_heads)?;
+        Ok(match context {
+            Context::Packed(_) => Self { k, v, shared: None },
             Context::Cached { shared, own } => {
                 let (k, v) = own.append(index, &k, &v)?;
-                (k, v, shared.and_then(|s| s.layer(index)))
+                Self { k, v, shared: shared.and_then(|s| s.layer(index)) }
             }
-        };
-        let (x, normed, table, layout) = match kept {
-            None => (x.clone(), normed, table, layout),
-            Some(Kept::None) => return Ok(x.narrow(0, 0, 0)?),
-            Some(Kept::Rows { rows, table, layout }) => {
-                (x.index_select(rows, 0)?, normed.index_select(rows, 0)?, table, layout)
-            }
-        };
-        let q = kernels::rope(&self.q_proj.forward(&normed)?, &table.cos, &table.sin, layout.heads)?;
-        let mixed = kernels::attention(&q, &k, &v, shared, layout)?;
-        let x = kernels::add(&x, &self.o_proj.forward(&mixed)?)?;
-        kernels::add(&x, &self.mlp.forward(&self.post_attention_layernorm.forward(&x)?)?)
+        })
     }
 }
 

@@ -68,6 +68,40 @@ impl Linear {
             None => Ok(y),
         }
     }
+
+    /// [`Linear::forward`] added to `residual`, `[n, out]`.
+    ///
+    /// # Errors
+    /// [`crate::Error::Argument`] or [`crate::Error::Tensors`] on another width.
+    pub fn forward_onto(&self, x: &Tensor, residual: &Tensor) -> Result<Tensor> {
+        match (&self.weight, &self.lora) {
+            (Matrix::Packed(packed), None) => packed.linear_onto(x, self.bias.as_ref(), residual),
+            _ => kernels::add(residual, &self.forward(x)?),
+        }
+    }
+
+    /// [`Linear::forward`] in parts of these widths, `[n, width]` each.
+    ///
+    /// # Errors
+    /// [`crate::Error::Argument`] or [`crate::Error::Tensors`] on another width.
+    pub fn forward_parts<const N: usize>(&self, x: &Tensor, widths: [usize; N]) -> Result<[Tensor; N]> {
+        array(match (&self.weight, &self.lora) {
+            (Matrix::Packed(packed), None) => packed.linear_parts(x, self.bias.as_ref(), &widths)?,
+            _ => {
+                let all = self.forward(x)?;
+                let mut first = 0;
+                let part = |width| {
+                    first += width;
+                    Ok(all.narrow(1, first - width, width)?.contiguous()?)
+                };
+                widths.into_iter().map(part).collect::<Result<_>>()?
+            }
+        })
+    }
+}
+
+fn array<const N: usize>(parts: Vec<Tensor>) -> Result<[Tensor; N]> {
+    parts.try_into().map_err(|parts: Vec<_>| Error::argument("parts", parts.len(), N.to_string()))
 }
 
 /// Linear layers that read the same input: one product where their weights are packed and none has an addition of its own.
@@ -109,20 +143,21 @@ impl<const N: usize> JoinedLinear<N> {
     /// # Errors
     /// [`crate::Error::Argument`] or [`crate::Error::Tensors`] on another width.
     pub fn forward(&self, x: &Tensor) -> Result<[Tensor; N]> {
-        let parts: Vec<Tensor> = match &self.form {
-            Joined::Apart(layers) => layers.iter().map(|layer| layer.forward(x)).collect::<Result<_>>()?,
+        self.first(x)
+    }
+
+    /// [`JoinedLinear::forward`] of the first `M` layers alone.
+    ///
+    /// # Errors
+    /// As [`JoinedLinear::forward`]; [`Error::Argument`] if there are fewer layers.
+    pub fn first<const M: usize>(&self, x: &Tensor) -> Result<[Tensor; M]> {
+        let count = M.min(N);
+        array(match &self.form {
+            Joined::Apart(layers) => layers[..count].iter().map(|l| l.forward(x)).collect::<Result<_>>()?,
             Joined::Packed { weight, bias } => {
-                let all = weight.linear(x, bias.as_ref())?;
-                let mut first = 0;
-                let parts = self.outputs.iter().map(|&outputs| {
-                    let part = all.narrow(1, first, outputs)?.contiguous()?;
-                    first += outputs;
-                    Ok(part)
-                });
-                parts.collect::<Result<_>>()?
+                weight.linear_parts(x, bias.as_ref(), &self.outputs[..count])?
             }
-        };
-        parts.try_into().map_err(|parts: Vec<_>| Error::argument("joined layers", parts.len(), N.to_string()))
+        })
     }
 }
 
@@ -185,11 +220,22 @@ impl GatedMlp {
     /// # Errors
     /// [`crate::Error::Tensors`] on another width.
     pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
-        let gated = match &self.inputs {
-            GateUp::Apart { gate, up } => kernels::swiglu(&gate.forward(x)?, &up.forward(x)?)?,
-            GateUp::Joined(both) => both.apply(x)?,
-        };
-        self.down.forward(&gated)
+        self.down.forward(&self.gated(x)?)
+    }
+
+    /// [`GatedMlp::forward`] added to `residual`, `[n, width]`.
+    ///
+    /// # Errors
+    /// [`crate::Error::Tensors`] on another width.
+    pub fn forward_onto(&self, x: &Tensor, residual: &Tensor) -> Result<Tensor> {
+        self.down.forward_onto(&self.gated(x)?, residual)
+    }
+
+    fn gated(&self, x: &Tensor) -> Result<Tensor> {
+        match &self.inputs {
+            GateUp::Apart { gate, up } => kernels::swiglu(&gate.forward(x)?, &up.forward(x)?),
+            GateUp::Joined(both) => both.apply(x),
+        }
     }
 }
 
@@ -265,6 +311,33 @@ mod tests {
                     let expected = values(&layer.forward(&x).unwrap());
                     assert_eq!(values(part), expected, "{name} {stored:?} {format} {lora:?}");
                 }
+                let (all, [one, two]) = (joined.forward(&x).unwrap(), joined.first(&x).unwrap());
+                assert_eq!([values(&one), values(&two)], [values(&all[0]), values(&all[1])]);
+                assert!(joined.first::<4>(&x).is_err());
+            }
+        }
+    }
+
+    #[test]
+    fn parts_and_sums_are_those_of_the_outputs() {
+        let (x, residual) = (random(&[5, WIDTH], 1), random(&[5, 40], 2));
+        let tensors = file(DType::BF16);
+        for (format, lora) in FORMATS.into_iter().flat_map(|f| LORA.map(|l| (f, l))) {
+            for (name, outputs) in LAYERS {
+                let weights = weights(&tensors, format, lora);
+                let layer = Linear::new(&weights, name, WIDTH, outputs, true).unwrap();
+                let all = layer.forward(&x).unwrap();
+                let parts = layer.forward_parts(&x, [3, outputs - 3]).unwrap();
+                assert_eq!(
+                    values(&Tensor::cat(&parts, 1).unwrap()),
+                    values(&all),
+                    "{name} {format} {lora:?}"
+                );
+                let residual = residual.narrow(1, 0, outputs).unwrap().contiguous().unwrap();
+                let sum = layer.forward_onto(&x, &residual).unwrap();
+                assert_eq!(values(&sum), values(&(&residual + all).unwrap()), "{name} {format} {lora:?}");
+                assert!(layer.forward_onto(&x, &x).is_err());
+                assert!(layer.forward_parts(&x, [3, outputs]).is_err());
             }
         }
     }
@@ -291,6 +364,8 @@ mod tests {
                     let close = (found - expected).abs() <= tolerance * (1.0 + expected.abs());
                     assert!(close, "{stored:?} {format} {lora:?}: {found}, expected {expected}");
                 }
+                let sum = (&x + mlp.forward(&x).unwrap()).unwrap();
+                assert_eq!(values(&mlp.forward_onto(&x, &x).unwrap()), values(&sum));
             }
         }
     }

@@ -38,14 +38,11 @@ impl VisionBlock {
 
     /// `[patches, hidden]` to the same.
     fn forward(&self, x: &Tensor, table: &RopeTable, layout: &AttentionLayout) -> Result<Tensor> {
-        let width = x.dim(1)?;
-        let qkv = self.qkv.forward(&self.norm1.forward(x)?)?; // [n, 3 * hidden]
-        let part = |i: usize| qkv.narrow(1, i * width, width)?.contiguous();
-        let q = kernels::rope(&part(0)?, &table.cos, &table.sin, layout.heads)?;
-        let k = kernels::rope(&part(1)?, &table.cos, &table.sin, layout.heads)?;
-        let mixed = kernels::attention(&q, &k, &part(2)?, None, layout)?;
-        let x = kernels::add(x, &self.proj.forward(&mixed)?)?;
-        kernels::add(&x, &self.mlp.forward(&self.norm2.forward(&x)?)?)
+        let [q, k, v] = self.qkv.forward_parts(&self.norm1.forward(x)?, [x.dim(1)?; 3])?;
+        let q = kernels::rope(&q, &table.cos, &table.sin, layout.heads)?;
+        let k = kernels::rope(&k, &table.cos, &table.sin, layout.heads)?;
+        let x = self.proj.forward_onto(&kernels::attention(&q, &k, &v, None, layout)?, x)?;
+        self.mlp.forward_onto(&self.norm2.forward(&x)?, &x)
     }
 }
 

@@ -74,8 +74,8 @@ impl PackedGate {
         expect_dims("x", x, &[n, self.both.panels.k])?;
         expect_cpu_f32("x", x)?;
         let finish = Finish { gated: true, ..self.both.finish(self.bias.as_deref()) };
-        let out = read(x, |x| Ok(self.both.product(kernel, x, n, self.outputs, finish)))?;
-        Ok(tensor(out, (n, self.outputs))?)
+        let mut parts = read(x, |x| Ok(self.both.product(kernel, x, n, &[self.outputs], finish)))?;
+        Ok(tensor(parts.pop().unwrap_or_default(), (n, self.outputs))?)
     }
 }
 

@@ -27,6 +27,8 @@ pub(super) struct Finish<'a> {
     pub(super) channels: Option<Channels<'a>>,
     /// Whether a panel's first half are gates of the other: `silu(first) * second`.
     pub(super) gated: bool,
+    /// What is added to the outputs at last, `[n, m]`.
+    pub(super) residual: Option<&'a [f32]>,
 }
 
 /// What turns the integer sums of each channel into its outputs.
@@ -109,27 +111,40 @@ pub(super) struct Job<'a> {
     pub(super) finish: Finish<'a>,
 }
 
-/// The result's buffer, of which tasks write rectangles that do not overlap.
+/// Some columns of the product, as a matrix of their own.
 #[derive(Clone, Copy)]
-pub(super) struct Target {
+struct Part {
     data: *mut f32,
+    first: usize,
     columns: usize,
 }
 
+/// The results' buffers, of which tasks write rectangles that do not overlap.
+#[derive(Clone, Copy)]
+pub(super) struct Target<'a>(&'a [Part]);
+
 // SAFETY: the tasks that share a `Target` write different elements.
-unsafe impl Send for Target {}
+unsafe impl Send for Target<'_> {}
 // SAFETY: as above.
-unsafe impl Sync for Target {}
+unsafe impl Sync for Target<'_> {}
 
 impl Job<'_> {
-    /// Writes every element of `out`, `[n, m]`.
-    pub(super) fn run(&self, out: &mut [MaybeUninit<f32>]) {
+    /// Writes every element of the results, `[n, columns]` each, which share the product's `m` columns in turn.
+    pub(super) fn run(&self, results: &mut [&mut [MaybeUninit<f32>]]) {
         let (n, m) = (self.left.n, self.m);
-        assert_eq!(out.len(), n * m);
-        if out.is_empty() {
+        if n == 0 || m == 0 {
             return;
         }
-        let target = Target { data: out.as_mut_ptr().cast(), columns: m };
+        let mut first = 0;
+        let part = |result: &mut &mut [MaybeUninit<f32>]| {
+            assert!(result.len().is_multiple_of(n));
+            let part = Part { data: result.as_mut_ptr().cast(), first, columns: result.len() / n };
+            first += part.columns;
+            part
+        };
+        let parts: Vec<Part> = results.iter_mut().map(part).collect();
+        assert!(first == m && self.finish.residual.is_none_or(|r| r.len() == n * m));
+        let target = Target(&parts);
         let count = m.div_ceil(self.finish.width());
         assert!(count * WIDTH * self.panels.steps <= self.panels.words().len());
         let (across, down) = (count.div_ceil(PANELS), n.div_ceil(TASK_ROWS));
@@ -147,10 +162,15 @@ impl Job<'_> {
 /// Writes the product's `rows` and `panels`.
 ///
 /// # Safety
-/// The CPU must have `T`'s instructions, and the job must be for `T`. `target` must be the `[n, m]` result, in which
-/// nothing else uses these rows of these panels.
+/// The CPU must have `T`'s instructions, and the job must be for `T`. `target` must be the results, `[n, columns]` each and `m` columns in
+/// all, in which nothing else uses these rows of these panels.
 #[inline(always)]
-pub(super) unsafe fn run<T: Tile>(job: &Job<'_>, target: Target, rows: Range<usize>, panels: Range<usize>) {
+pub(super) unsafe fn run<T: Tile>(
+    job: &Job<'_>,
+    target: Target<'_>,
+    rows: Range<usize>,
+    panels: Range<usize>,
+) {
     let Job { left, panels: weight, .. } = job;
     // SAFETY: the caller has the instructions.
     let mut state = unsafe { T::start() };
@@ -220,15 +240,15 @@ fn operands<T: Tile>(left: &Left, rows: Range<usize>, right: &[u32], steps: &Ran
 unsafe fn finish<T: Tile>(
     job: &Job<'_>,
     by: &PanelFinish,
-    target: Target,
+    target: Target<'_>,
     row: usize,
     panel: usize,
     sums: &mut [u32],
 ) {
     let width = job.finish.width();
     let columns = panel * width..job.m.min((panel + 1) * width);
-    let count = columns.len();
-    for (r, sums) in sums.as_chunks_mut::<WIDTH>().0.iter_mut().enumerate() {
+    let rows = sums.as_chunks_mut::<WIDTH>().0;
+    for (r, sums) in rows.iter_mut().enumerate() {
         by.row(sums, job.left.scales[row + r]);
         if job.finish.gated {
             match T::LANES {
@@ -237,12 +257,25 @@ unsafe fn finish<T: Tile>(
                 _ => gate::<4>(sums),
             }
         }
-        // SAFETY: the caller's promise; the last column is below `m`; the bits are those of f32.
-        unsafe {
-            let to = target.data.add((row + r) * target.columns + columns.start).cast::<u32>();
-            match count {
-                WIDTH => to.copy_from_nonoverlapping(sums.as_ptr(), WIDTH),
-                _ => to.copy_from_nonoverlapping(sums.as_ptr(), count),
+        if let Some(residual) = job.finish.residual {
+            let residual = &residual[(row + r) * job.m..][columns.clone()];
+            for (sum, x) in sums.iter_mut().zip(residual) {
+                *sum = (f32::from_bits(*sum) + x).to_bits();
+            }
+        }
+    }
+    for part in target.0 {
+        let start = columns.start.max(part.first);
+        let count = columns.end.min(part.first + part.columns).saturating_sub(start);
+        for (r, sums) in rows.iter().enumerate().filter(|_| count > 0) {
+            let sums = &sums[start - columns.start..][..count];
+            // SAFETY: the caller's promise; the columns are some of the part's; the bits are those of f32.
+            unsafe {
+                let to = part.data.add((row + r) * part.columns + start - part.first).cast::<u32>();
+                match count {
+                    WIDTH => to.copy_from_nonoverlapping(sums.as_ptr(), WIDTH),
+                    _ => to.copy_from_nonoverlapping(sums.as_ptr(), count),
+                }
             }
         }
     }

@@ -27,7 +27,7 @@ pub(super) struct Kernel {
     /// The CPU must have the kernel's instructions, as it has where a `Kernel` exists.
     pub(super) convert: unsafe fn(&mut [u32], &[f32]) -> f32,
     /// [`run`] for the kernel's way of adding; safety as there.
-    pub(super) run: unsafe fn(&Job<'_>, Target, Range<usize>, Range<usize>),
+    pub(super) run: unsafe fn(&Job<'_>, Target<'_>, Range<usize>, Range<usize>),
 }
 
 /// Defines a kernel compiled for some target features.
@@ -44,7 +44,7 @@ macro_rules! kernel {
                 }
             }
             $(#[target_feature(enable = $features)])?
-            unsafe fn multiply(job: &Job<'_>, target: Target, rows: Range<usize>, panels: Range<usize>) {
+            unsafe fn multiply(job: &Job<'_>, target: Target<'_>, rows: Range<usize>, panels: Range<usize>) {
                 // SAFETY: the caller's promise.
                 unsafe { run::<$dot>(job, target, rows, panels) }
             }

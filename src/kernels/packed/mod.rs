@@ -117,43 +117,99 @@ impl PackedWeight {
         self.linear_by(Kernel::current(self.format), x, bias)
     }
 
-    fn linear_by(&self, kernel: Kernel, x: &Tensor, bias: Option<&Tensor>) -> Result<Tensor> {
-        let (m, k) = self.dims();
-        let (n, _) = dims2("x", x)?;
-        expect_dims("x", x, &[n, k])?;
-        expect_cpu_f32("x", x)?;
-        if let Some(bias) = bias {
-            expect_dims("bias", bias, &[m])?;
-            expect_cpu_f32("bias", bias)?;
-        }
-        let product = |x: &[f32], bias: Option<&[f32]>| Ok(self.product(kernel, x, n, m, self.finish(bias)));
-        let out = read(x, |x| match bias {
-            Some(bias) => read(bias, |bias| product(x, Some(bias))),
-            None => product(x, None),
-        })?;
-        Ok(tensor(out, (n, m))?)
+    /// `r + (x W^T + b)`, rounded as the sum of the two is: `residual` `r` is `[n, m]`, the rest as for [`PackedWeight::linear`].
+    ///
+    /// # Errors
+    /// [`Error::Argument`] for another shape, type or device.
+    pub fn linear_onto(&self, x: &Tensor, bias: Option<&Tensor>, residual: &Tensor) -> Result<Tensor> {
+        let (m, _) = self.dims();
+        let mut parts = self.multiply(Kernel::current(self.format), x, bias, Some(residual), &[m])?;
+        parts.pop().ok_or_else(|| Error::argument("outputs", 0, "one part"))
     }
 
-    /// `[n, m]`, of the `m` outputs that `finish` leaves.
-    fn product(&self, kernel: Kernel, x: &[f32], n: usize, m: usize, finish: Finish<'_>) -> Vec<f32> {
-        let k = self.panels.k;
-        let mut out = Vec::with_capacity(n * m);
-        let rows = lhs::rows_at_once(kernel, k);
-        let room = &mut out.spare_capacity_mut()[..n * m];
-        for (i, out) in room.chunks_mut((rows * m).max(1)).enumerate() {
-            let n = out.len() / m;
-            let left = Left::new(kernel, &x[i * rows * k..(i * rows + n) * k], n, k);
-            Job { kernel, left: &left, panels: &self.panels, m, finish }.run(out);
+    /// The outputs of [`PackedWeight::linear`] in parts of these widths, `[n, width]` each; what the widths leave out at the end is not
+    /// computed.
+    ///
+    /// # Errors
+    /// [`Error::Argument`] for another shape, type or device, or widths of more than all outputs.
+    pub fn linear_parts(&self, x: &Tensor, bias: Option<&Tensor>, widths: &[usize]) -> Result<Vec<Tensor>> {
+        self.multiply(Kernel::current(self.format), x, bias, None, widths)
+    }
+
+    fn linear_by(&self, kernel: Kernel, x: &Tensor, bias: Option<&Tensor>) -> Result<Tensor> {
+        let mut parts = self.multiply(kernel, x, bias, None, &[self.panels.m])?;
+        parts.pop().ok_or_else(|| Error::argument("outputs", 0, "one part"))
+    }
+
+    fn multiply(
+        &self,
+        kernel: Kernel,
+        x: &Tensor,
+        bias: Option<&Tensor>,
+        residual: Option<&Tensor>,
+        widths: &[usize],
+    ) -> Result<Vec<Tensor>> {
+        let (m, k) = self.dims();
+        let (n, _) = dims2("x", x)?;
+        let known = [("x", Some(x), &[n, k][..]), ("bias", bias, &[m]), ("residual", residual, &[n, m])];
+        for (name, tensor, dims) in known {
+            if let Some(tensor) = tensor {
+                expect_dims(name, tensor, dims)?;
+                expect_cpu_f32(name, tensor)?;
+            }
+        }
+        if widths.iter().try_fold(0usize, |sum, &width| sum.checked_add(width)).is_none_or(|sum| sum > m) {
+            return Err(Error::argument("widths", format!("{widths:?}"), format!("{m} outputs at most")));
+        }
+        let parts = read(x, |x| {
+            read_some(bias, |bias| {
+                read_some(residual, |residual| {
+                    Ok(self.product(kernel, x, n, widths, Finish { residual, ..self.finish(bias) }))
+                })
+            })
+        })?;
+        let parts = parts.into_iter().zip(widths).map(|(part, &width)| Ok(tensor(part, (n, width))?));
+        parts.collect()
+    }
+
+    /// The outputs that `finish` leaves in parts of these widths, `[n, width]` each.
+    fn product(
+        &self,
+        kernel: Kernel,
+        x: &[f32],
+        n: usize,
+        widths: &[usize],
+        finish: Finish<'_>,
+    ) -> Vec<Vec<f32>> {
+        let (k, m) = (self.panels.k, widths.iter().sum());
+        let mut parts: Vec<Vec<f32>> = widths.iter().map(|width| Vec::with_capacity(n * width)).collect();
+        let step = lhs::rows_at_once(kernel, k);
+        for first in (0..n).step_by(step) {
+            let rows = first..n.min(first + step);
+            let room = parts.iter_mut().zip(widths);
+            let mut room: Vec<_> =
+                room.map(|(p, w)| &mut p.spare_capacity_mut()[rows.start * w..rows.end * w]).collect();
+            let residual = finish.residual.map(|r| &r[rows.start * m..rows.end * m]);
+            let left = Left::new(kernel, &x[rows.start * k..rows.end * k], rows.len(), k);
+            let finish = Finish { residual, ..finish };
+            Job { kernel, left: &left, panels: &self.panels, m, finish }.run(&mut room);
             left.recycle();
         }
-        // SAFETY: the chunks are all of `room`, and a job writes every element of its own.
-        unsafe { out.set_len(n * m) };
-        out
+        for (part, width) in parts.iter_mut().zip(widths) {
+            // SAFETY: the jobs' rows are all rows, and a job writes every element of its own.
+            unsafe { part.set_len(n * width) };
+        }
+        parts
     }
 
     fn finish<'a>(&'a self, bias: Option<&'a [f32]>) -> Finish<'a> {
         let channels = Channels { scales: &self.scales, offsets: &self.offsets };
-        Finish { bias, gated: false, channels: (self.format == WeightFormat::Int8).then_some(channels) }
+        Finish {
+            bias,
+            gated: false,
+            residual: None,
+            channels: (self.format == WeightFormat::Int8).then_some(channels),
+        }
     }
 
     /// Rows of the weight as f32 `[ids, k]`: an embedding lookup, or some rows of an output head.
@@ -183,6 +239,17 @@ fn spread<const N: usize>(out: &mut [f32], words: impl Iterator<Item = [f32; N]>
         for (o, value) in out.iter_mut().zip(word) {
             *o = value;
         }
+    }
+}
+
+/// [`read`] of what may not be there.
+fn read_some<R>(
+    tensor: Option<&Tensor>,
+    f: impl FnOnce(Option<&[f32]>) -> candle_core::Result<R>,
+) -> candle_core::Result<R> {
+    match tensor {
+        Some(tensor) => read(tensor, |values| f(Some(values))),
+        None => f(None),
     }
 }
 

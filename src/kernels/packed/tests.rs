@@ -113,10 +113,34 @@ fn every_element_is_written() {
             let left = Left::new(kernel, &x, n, k);
             let mut out = vec![MaybeUninit::new(f32::NAN); n * m];
             let finish = packed.finish(None);
-            Job { kernel, left: &left, panels: &packed.panels, m, finish }.run(&mut out);
+            Job { kernel, left: &left, panels: &packed.panels, m, finish }.run(&mut [&mut out]);
             // SAFETY: every element was initialised above.
             let written = out.iter().all(|v| unsafe { v.assume_init() }.is_finite());
             assert!(written, "{} {n}x{k}x{m}", kernel.name);
+        }
+    }
+}
+
+#[test]
+fn parts_and_sums_are_those_of_the_outputs() {
+    // The last has more rows than are converted at once.
+    for (n, k, m) in SHAPES.into_iter().chain([(400, 9000, 3)]) {
+        let (x, w) = (random(&[n, k], 1), values(&random(&[m, k], 2)));
+        let (bias, residual) = (random(&[m], 3), random(&[n, m], 4));
+        for format in [WeightFormat::Bf16, WeightFormat::Int8] {
+            let packed = packed_as(format, &w, m, k);
+            let every = every_kernel(format);
+            for kernel in if n > 300 { &every[every.len() - 2..] } else { &every[..] } {
+                let case = format!("{} {format} {n}x{k}x{m}", kernel.name);
+                let all = packed.linear_by(*kernel, &x, Some(&bias)).unwrap();
+                let sum = packed.multiply(*kernel, &x, Some(&bias), Some(&residual), &[m]).unwrap();
+                assert_eq!(values(&sum[0]), values(&(&residual + &all).unwrap()), "{case}");
+                // One part within a panel, one over its edge, the last left out.
+                let widths = [m / 5, m - m / 5 - m / 7];
+                let parts = packed.multiply(*kernel, &x, Some(&bias), None, &widths).unwrap();
+                let first = all.narrow(1, 0, m - m / 7).unwrap();
+                assert_eq!(values(&Tensor::cat(&parts, 1).unwrap()), values(&first), "{case}");
+            }
         }
     }
 }
@@ -155,6 +179,9 @@ fn what_does_not_fit_is_an_error() {
     let packed = packed_as(WeightFormat::Bf16, &[0.0; 6], 2, 3);
     assert!(packed.linear(&random(&[2, 2], 1), None).is_err());
     assert!(packed.linear(&random(&[2, 3, 1], 1), None).is_err());
+    assert!(packed.linear_onto(&random(&[2, 3], 1), None, &random(&[2, 3], 1)).is_err());
+    assert!(packed.linear_parts(&random(&[2, 3], 1), None, &[1, 2]).is_err());
+    assert!(packed.linear_parts(&random(&[2, 3], 1), None, &[usize::MAX, 2]).is_err());
     assert!(packed.linear(&random(&[2, 3], 1), Some(&random(&[3], 1))).is_err());
     assert!(packed.linear(&random(&[2, 3], 1).to_dtype(DType::F64).unwrap(), None).is_err());
 }
