@@ -8,7 +8,7 @@ pub(crate) use super::stored::StoredFile;
 use crate::error::{Error, Result};
 use crate::kernels::WeightFormat;
 use candle_core::{DType, Device, Tensor};
-use std::cell::RefCell;
+use std::cell::{Cell, RefCell};
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::path::Path;
 
@@ -61,6 +61,8 @@ pub struct Weights {
     misshaped: RefCell<Vec<Misshaped>>,
     /// What stands in for tensors that are missing, misshaped, or not converted since others are.
     stand_ins: RefCell<BTreeMap<String, Vec<usize>>>,
+    /// Values of those for which zeros were allocated.
+    zeros: Cell<usize>,
 }
 
 /// Maps an in-memory name of `transformers` >= 4.52, or one below the prefix that PEFT writes, to the published one.
@@ -89,6 +91,7 @@ impl Weights {
             missing: RefCell::default(),
             misshaped: RefCell::default(),
             stand_ins: RefCell::default(),
+            zeros: Cell::default(),
         }
     }
 
@@ -182,7 +185,7 @@ impl Weights {
         if self.made.is_some() || self.find(name, shape).is_some() {
             return Ok(true);
         }
-        self.stand_in(name, shape, false)?;
+        self.stand_in(name, shape)?;
         Ok(false)
     }
 
@@ -221,13 +224,10 @@ impl Weights {
         match self.find(name, shape) {
             Some(Source::Tensor(t)) => Ok(t.to_dtype(DType::F32)?),
             Some(Source::Stored(s)) => s.f32(&self.device),
-            None => self.make(name, shape)?.map_or_else(
-                || {
-                    self.stand_in(name, shape, true)?;
-                    Ok(Tensor::zeros(shape, DType::F32, &Device::Cpu)?)
-                },
-                Ok,
-            ),
+            None => match self.make(name, shape)? {
+                Some(made) => Ok(made),
+                None => self.zeros(name, shape),
+            },
         }
     }
 
@@ -247,7 +247,7 @@ impl Weights {
             None => match self.make(name, &shape)? {
                 Some(made) => Ok(Raw::Tensor(made)),
                 None => {
-                    self.stand_in(name, &shape, false)?;
+                    self.stand_in(name, &shape)?;
                     Ok(Raw::Absent(shape))
                 }
             },
@@ -264,18 +264,21 @@ impl Weights {
         Ok(made.transpose()?)
     }
 
-    fn stand_in(&self, name: &str, shape: &[usize], allocated: bool) -> Result<()> {
-        let mut all = self.stand_ins.borrow_mut();
-        all.insert(name.to_string(), shape.to_vec());
-        let values = |s: &[usize]| s.iter().try_fold(1usize, |n, &d| n.checked_mul(d));
-        let enough = if allocated {
-            let others = all.iter().filter(|(n, s)| s.len() != 2 || *n == name);
-            let total = others.map(|(_, s)| values(s)).try_fold(0usize, |n, v| n.checked_add(v?));
-            total.is_some_and(|n| n <= STAND_INS)
-        } else {
-            values(shape).is_some()
-        };
-        if enough { Ok(()) } else { Err(self.wrong(Vec::new())) }
+    /// Records what is asked for and cannot be had; gives the number of its values.
+    fn stand_in(&self, name: &str, shape: &[usize]) -> Result<usize> {
+        self.stand_ins.borrow_mut().insert(name.to_string(), shape.to_vec());
+        let values = shape.iter().try_fold(1usize, |n, &d| n.checked_mul(d));
+        values.ok_or_else(|| self.wrong(Vec::new()))
+    }
+
+    /// Zeros in place of a tensor that cannot be had.
+    fn zeros(&self, name: &str, shape: &[usize]) -> Result<Tensor> {
+        let all = self.zeros.get().saturating_add(self.stand_in(name, shape)?);
+        if all > STAND_INS {
+            return Err(self.wrong(Vec::new()));
+        }
+        self.zeros.set(all);
+        Ok(Tensor::zeros(shape, DType::F32, &Device::Cpu)?)
     }
 
     /// What was found to be wrong so far, and these tensors.
@@ -319,5 +322,26 @@ impl Weights {
         unexpected.sort();
         let complete = self.missing.borrow().is_empty() && self.misshaped.borrow().is_empty();
         if complete && unexpected.is_empty() { Ok(()) } else { Err(self.wrong(unexpected)) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_stands_in_for_missing_tensors_has_a_limit() {
+        let weights = Weights::empty("nothing", &Device::Cpu);
+        assert_eq!(weights.get("a", &[3, 4]).unwrap().dims(), [3, 4]);
+        // Matrices take no memory, whatever they hold.
+        assert_eq!(weights.matrix("b", [1 << 30, 1 << 30]).unwrap().dims(), (1 << 30, 1 << 30));
+        let missing = |error: Result<Tensor>| match error {
+            Err(Error::TensorSet { missing, .. }) => missing,
+            other => panic!("{other:?}"),
+        };
+        assert_eq!(missing(weights.get("c", &[STAND_INS])), ["a", "b", "c"]);
+        assert!(weights.get("d", &[7]).is_ok());
+        assert_eq!(missing(weights.get("e", &[usize::MAX, 2])).len(), 5);
+        assert_eq!(weights.wanted().len(), 5);
     }
 }
