@@ -7,6 +7,7 @@ mod camera;
 mod cast;
 mod furniture;
 mod light;
+mod objects;
 mod patterns;
 mod rooms;
 #[cfg(feature = "benchmarks")]
@@ -14,6 +15,7 @@ mod shapes;
 mod space;
 mod stage;
 mod streets;
+mod tables;
 mod texture;
 
 use image::RgbImage;

@@ -1,6 +1,7 @@
 //! The published files of a checkpoint that are not tensors, from a directory or from memory.
 
-use super::config::{VlmConfig, parse_json};
+use super::config::VlmConfig;
+use super::json::parse_json;
 use super::preprocess::{IMAGE_PROCESSOR, PreprocessorConfig};
 use super::tokenizer::Tokenizer;
 use crate::error::{Error, Result};

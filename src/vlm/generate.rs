@@ -2,8 +2,8 @@
 
 use super::QwenVl;
 use super::checkpoint::{CONFIG, Source};
-use super::config::Node;
 use super::decoder::Keep;
+use super::json::Node;
 use super::rope::Position;
 use crate::error::{Error, Result};
 use candle_core::{DType, Tensor};

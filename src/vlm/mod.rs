@@ -10,6 +10,7 @@ pub mod config;
 pub mod decoder;
 pub mod generate;
 pub mod grid;
+mod json;
 pub mod linear;
 pub mod lora;
 pub mod matrix;

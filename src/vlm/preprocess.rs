@@ -1,7 +1,7 @@
 //! From an RGB frame to the rows of the patch embedding, as the published image processor does it.
 
-use super::config::Node;
 use super::grid::Grid;
+use super::json::Node;
 use super::resize;
 use crate::error::{Error, Result};
 use candle_core::{Device, Tensor};

@@ -1,6 +1,6 @@
 //! Which files of a checkpoint directory hold its tensors.
 
-use super::config::read_json;
+use super::json::read_json;
 use super::weights::Weights;
 use crate::error::{Error, Result};
 use candle_core::Device;
