@@ -90,3 +90,30 @@ fn threads_do_not_matter() {
     let weight = packed(&values(&random(&[600, 70], 2)), 600, 70);
     same_on_any_thread_count(|| vec![weight.linear(&x, None).unwrap()]);
 }
+
+/// The figures that [`WeightFormat`] states: a row's scale follows its largest value, and the other channels pay for it.
+#[test]
+fn one_large_channel_costs_the_others_their_precision() {
+    let (m, k) = (256, 2048);
+    let (w, small) = (values(&random(&[m, k], 1)), values(&random(&[1, k], 2)));
+    let weights = [PackedWeight::bf16_from_f32(&w, m, k).unwrap(), packed(&w, m, k)];
+    let rms = |v: &[f64]| (v.iter().map(|v| v * v).sum::<f64>() / v.len() as f64).sqrt();
+    for (largest, expected) in [(1.0, [0.0020, 0.0061]), (10.0, [0.0022, 0.043]), (100.0, [0.0062, 0.37])] {
+        let x = [&[largest], &small[1..]].concat();
+        let sum = |w: &[f32]| x.iter().zip(w).map(|(x, w)| f64::from(*x) * f64::from(*w)).sum::<f64>();
+        let exact: Vec<f64> = w.chunks(k).map(sum).collect();
+        let others: Vec<f64> =
+            exact.iter().zip(w.chunks(k)).map(|(e, w)| e - f64::from(largest) * f64::from(w[0])).collect();
+        for (weight, expected) in weights.iter().zip(expected) {
+            let found = values(&weight.linear(&matrix(x.clone(), 1, k), None).unwrap());
+            let errors: Vec<f64> = found.iter().zip(&exact).map(|(f, e)| f64::from(*f) - e).collect();
+            // Of what the other channels add up to.
+            let error = rms(&errors) / rms(&others);
+            assert!(
+                (error / expected - 1.0).abs() < 0.1,
+                "{}, largest {largest}: {error:.4}",
+                weight.format()
+            );
+        }
+    }
+}
