@@ -6,13 +6,32 @@ use crate::error::{Error, Result};
 use candle_core::Device;
 
 /// How the weights of a model are held in memory.
+///
+/// What rounding costs beside f32; commands and more figures stand in `benches/RESULTS.md`, "Accuracy of the formats":
+///
+/// | | f32 | bf16 | int8 |
+/// |---|---|---|---|
+/// | `sdim-tiny`, 12 real frames, 500 points, MAE | 0.2958 m | +0.0004 m | -0.0002 m |
+/// | `sdim-tiny`, 100 procedural scenes, 500 points, MAE | 0.3630 m | -0.0001 m | +0.0004 m |
+/// | final states of seven small random models, root mean square of the difference | | 1.5 to 7.4 % | 4.7 to 20 % |
+/// | 20 best first logits of the full 3B shapes, random weights | | 20 the same, within 0.9 % | 18 the same, within 7.5 % |
+///
+/// ```sh
+/// cargo run --release --example evaluate -- --layout folder --data FRAMES --points 500 --weights int8
+/// cargo test --release --test golden formats -- --nocapture
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum WeightFormat {
     /// 32-bit floats, as plain tensors; the one format that can be trained.
     F32,
     /// 16-bit floats with the exponent range of f32 (8 bits of precision), as checkpoints are published.
     Bf16,
-    /// Signed bytes with one scale per output channel.
+    /// Signed bytes with one scale per output channel, for every matrix, embedding and output head included. Rows of activations are rounded
+    /// to bytes too, each by its largest value.
+    ///
+    /// A channel far above the others therefore costs those their precision: in a row of 2048, what the others add up to is off by 0.6 %
+    /// without one, by 4.3 % beside one of 10 times their range, by 37 % beside one of 100 times (bf16: 0.2, 0.2 and 0.6 %). Trained language
+    /// models have such channels and random ones do not: measure a checkpoint in this format before relying on it.
     Int8,
 }
 

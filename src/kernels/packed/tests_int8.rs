@@ -96,7 +96,7 @@ fn threads_do_not_matter() {
 fn one_large_channel_costs_the_others_their_precision() {
     let (m, k) = (256, 2048);
     let (w, small) = (values(&random(&[m, k], 1)), values(&random(&[1, k], 2)));
-    let weights = [PackedWeight::bf16_from_f32(&w, m, k).unwrap(), packed(&w, m, k)];
+    let weights = [WeightFormat::Bf16, WeightFormat::Int8].map(|format| packed_as(format, &w, m, k));
     let rms = |v: &[f64]| (v.iter().map(|v| v * v).sum::<f64>() / v.len() as f64).sqrt();
     for (largest, expected) in [(1.0, [0.0020, 0.0061]), (10.0, [0.0022, 0.043]), (100.0, [0.0062, 0.37])] {
         let x = [&[largest], &small[1..]].concat();
