@@ -17,6 +17,8 @@ enum Isa {
     /// AVX-512, and AMX for packed weights.
     #[cfg(target_arch = "x86_64")]
     Amx,
+    #[cfg(target_arch = "aarch64")]
+    Neon,
 }
 
 impl Level {
@@ -42,6 +44,11 @@ impl Level {
                 }
             }
         }
+        // The packed words are read as little-endian.
+        #[cfg(target_arch = "aarch64")]
+        if cfg!(target_endian = "little") && std::arch::is_aarch64_feature_detected!("neon") {
+            levels.push(Level(Isa::Neon));
+        }
         levels
     }
 
@@ -55,6 +62,8 @@ impl Level {
             Isa::Avx512 => "avx512",
             #[cfg(target_arch = "x86_64")]
             Isa::Amx => "amx",
+            #[cfg(target_arch = "aarch64")]
+            Isa::Neon => "neon",
         }
     }
 
@@ -72,6 +81,11 @@ impl Level {
     #[cfg(target_arch = "x86_64")]
     pub(super) fn is_avx2(self) -> bool {
         self.0 == Isa::Avx2
+    }
+
+    #[cfg(target_arch = "aarch64")]
+    pub(super) fn is_neon(self) -> bool {
+        self.0 == Isa::Neon
     }
 
     /// The level in use. A `SDIM_KERNEL` that the machine lacks, or that is no level's name, is
@@ -100,7 +114,7 @@ fn choose(asked: Option<&str>) -> Level {
 }
 
 /// Defines `fn $name(level, args..)` that runs `$body::<LANES>(args..)` compiled for that level, with
-/// `LANES` f32 to a register: 4, 8 or 16. The body must be `#[inline(always)]` and contain no closure that another thread runs.
+/// `LANES` f32 to a register: 4, 8 or 16, or 1 where that is left to the compiler. The body must be `#[inline(always)]` and contain no closure that another thread runs.
 macro_rules! per_level {
     ($(#[$meta:meta])* fn $name:ident $(<$(const $c:ident : usize),+>)? ($($arg:ident : $ty:ty),* $(,)?) $(-> $out:ty)? = $body:ident) => {
         $(#[$meta])*
@@ -127,8 +141,13 @@ macro_rules! per_level {
                     return unsafe { avx2 $(::<$($c),+>)? ($($arg),*) };
                 }
             }
+            // NEON is part of what this architecture's code is compiled for.
+            #[cfg(target_arch = "aarch64")]
+            if level.is_neon() {
+                return $body::<4 $($(, $c)+)?>($($arg),*);
+            }
             let _ = level;
-            $body::<4 $($(, $c)+)?>($($arg),*)
+            $body::<1 $($(, $c)+)?>($($arg),*)
         }
     };
 }
@@ -162,6 +181,15 @@ mod tests {
     fn portable_is_always_there_and_can_be_forced() {
         assert_eq!(choose(Some("portable")).name(), "portable");
         assert_eq!(Level::available()[0].name(), "portable");
+    }
+
+    /// So that no run of the tests which asks for a level is one of another.
+    #[test]
+    fn the_level_that_is_asked_for_is_used() {
+        match std::env::var("SDIM_KERNEL") {
+            Ok(asked) => assert_eq!(Level::current().name(), asked, "SDIM_KERNEL asks for what is not here"),
+            Err(_) => assert_eq!(Level::current(), choose(None)),
+        }
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! Scalar functions written so that the compiler can vectorise loops over them: no branches, no
-//! library calls. `LANES` is what a register holds; only the portable code, 4, may lack a fused
-//! multiply-add.
+//! library calls. `LANES` is what a register holds, 1 in portable code; that, and 4, may lack a
+//! fused multiply-add.
 
 /// `a * b + c`, fused where that is one instruction; elsewhere it would be a library call.
 #[inline(always)]

@@ -5,9 +5,10 @@
 //! threads), with its own backward pass. Every other device and type takes the same mathematics
 //! composed from candle operations.
 //!
-//! The environment variable `SDIM_KERNEL` = `portable`, `avx2`, `avx512` or `amx` forces one instruction
-//! set, if the machine has it; it is read once, at the first call. (AMX multiplies packed weights only; with
-//! it, everything else uses AVX-512.)
+//! The environment variable `SDIM_KERNEL` forces one instruction set, if the machine has it: `portable`; `avx2`, `avx512` or
+//! `amx` on x86-64; `neon` on 64-bit Arm. It is read once, at the first call. (AMX multiplies packed weights only; with
+//! it, everything else uses AVX-512. The dot products of AVX-512, AVX2 and NEON, of bf16 and of bytes, are used at these levels where
+//! the machine has them.)
 //!
 //! This module knows nothing of images or depth, and is the only home of `unsafe` in the crate.
 

@@ -49,8 +49,20 @@ fn once(format: WeightFormat) -> usize {
             return unsafe { x86::avx2::<__m256>() };
         }
     }
+    #[cfg(target_arch = "aarch64")]
+    if level.is_neon() {
+        use std::arch::is_aarch64_feature_detected;
+        // SAFETY: NEON is part of what this architecture's code is compiled for; the extensions are asked for here.
+        return unsafe {
+            match format {
+                WeightFormat::Bf16 if is_aarch64_feature_detected!("bf16") => neon::bf16(),
+                WeightFormat::Int8 if is_aarch64_feature_detected!("dotprod") => neon::int8(),
+                _ => floats::<std::arch::aarch64::float32x4_t>(),
+            }
+        };
+    }
     let _ = (level, format);
-    // SAFETY: every machine of this architecture has the baseline.
+    // SAFETY: portable code, or a register that every machine of this architecture has.
     unsafe { floats::<Baseline>() }
 }
 
@@ -74,6 +86,39 @@ unsafe fn floats<V: Vector>() -> usize {
         }
     }
     2 * V::LANES * SUMS * STEPS
+}
+
+#[cfg(target_arch = "aarch64")]
+mod neon {
+    use super::{STEPS, SUMS};
+    use crate::kernels::packed::neon::{bfdot, sdot};
+    use std::arch::aarch64::*;
+
+    #[target_feature(enable = "neon,bf16")]
+    pub(super) fn bf16() -> usize {
+        let mut sums = [vdupq_n_f32(0.0); SUMS];
+        let halves = vdupq_n_u32(std::hint::black_box(0x3f00_3f00));
+        for _ in 0..STEPS {
+            for sum in &mut sums {
+                *sum = bfdot::<0>(*sum, halves, halves);
+            }
+        }
+        std::hint::black_box(sums);
+        2 * 8 * SUMS * STEPS
+    }
+
+    #[target_feature(enable = "neon,dotprod")]
+    pub(super) fn int8() -> usize {
+        let mut sums = [vdupq_n_s32(0); SUMS];
+        let threes = vdupq_n_u32(std::hint::black_box(0x0303_0303));
+        for _ in 0..STEPS {
+            for sum in &mut sums {
+                *sum = sdot::<0>(*sum, threes, threes);
+            }
+        }
+        std::hint::black_box(sums);
+        2 * 16 * SUMS * STEPS
+    }
 }
 
 #[cfg(target_arch = "x86_64")]

@@ -52,9 +52,13 @@ fn multiply_body<const LANES: usize>(
     }
 }
 
-/// Columns of a strip: two registers. (One of AVX-512 where panels have 16 columns.)
+/// Columns of a strip: two registers, four of NEON. (One of AVX-512 where panels have 16 columns.)
 const fn strip_width(lanes: usize) -> usize {
-    if cfg!(target_arch = "x86_64") { 2 * lanes } else { 2 * Baseline::LANES }
+    match lanes {
+        1 => 2 * Baseline::LANES,
+        4 => 4 * lanes,
+        _ => 2 * lanes,
+    }
 }
 
 /// Elements of the widest strip.
@@ -83,7 +87,7 @@ fn strips<const LANES: usize>(
     b: Strip<'_>,
     init: Init<'_>,
 ) {
-    // SAFETY: `LANES` is 16 or 8 only inside functions compiled for, and called on, such machines;
+    // SAFETY: `LANES` is above 1 only inside functions compiled for, and called on, such machines;
     // `multiply_body` checked the operands' sizes.
     unsafe {
         #[cfg(target_arch = "x86_64")]
@@ -94,6 +98,11 @@ fn strips<const LANES: usize>(
             16 => return strip::<std::arch::x86_64::__m512, 12, 1>(dst, stride, m, lhs, b, init),
             8 => return strip::<std::arch::x86_64::__m256, 6, 2>(dst, stride, m, lhs, b, init),
             _ => {}
+        }
+        #[cfg(target_arch = "aarch64")]
+        if LANES == 4 {
+            // A step loads something for each row and each register of columns: 6 + 4 are fewer than 12 + 2.
+            return strip::<std::arch::aarch64::float32x4_t, 6, 4>(dst, stride, m, lhs, b, init);
         }
         strip::<Baseline, 6, 2>(dst, stride, m, lhs, b, init)
     }

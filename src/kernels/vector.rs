@@ -96,7 +96,46 @@ mod x86 {
     );
 }
 
-/// The register that every machine of this architecture has.
+#[cfg(target_arch = "aarch64")]
+mod neon {
+    use super::Vector;
+    use std::arch::aarch64::*;
+
+    impl Vector for float32x4_t {
+        const LANES: usize = 4;
+        #[inline(always)]
+        unsafe fn splat(x: f32) -> Self {
+            // SAFETY: NEON is part of what this architecture's code is compiled for.
+            unsafe { vdupq_n_f32(x) }
+        }
+        #[inline(always)]
+        unsafe fn load(from: *const f32) -> Self {
+            // SAFETY: the caller's pointer is good for four elements.
+            unsafe { vld1q_f32(from) }
+        }
+        #[inline(always)]
+        unsafe fn store(self, to: *mut f32) {
+            // SAFETY: the caller's pointer is good for four elements.
+            unsafe { vst1q_f32(to, self) }
+        }
+        #[inline(always)]
+        unsafe fn madd(self, b: Self, c: Self) -> Self {
+            // SAFETY: as above.
+            unsafe { vfmaq_f32(c, self, b) }
+        }
+        #[inline(always)]
+        unsafe fn halves(from: *const u32) -> [Self; 2] {
+            // SAFETY: the caller's pointer is good for four words.
+            unsafe {
+                let words = vld1q_u32(from);
+                let upper = vandq_u32(words, vdupq_n_u32(0xffff_0000));
+                [vreinterpretq_f32_u32(vshlq_n_u32::<16>(words)), vreinterpretq_f32_u32(upper)]
+            }
+        }
+    }
+}
+
+/// The register of portable code: on x86-64 the one that every machine has.
 #[cfg(target_arch = "x86_64")]
 pub(super) type Baseline = std::arch::x86_64::__m128;
 #[cfg(not(target_arch = "x86_64"))]

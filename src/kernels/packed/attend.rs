@@ -1,5 +1,8 @@
 //! Softmax attention of a few query rows over packed keys, in bf16 with sums in f32.
 
+// Only x86-64 has a kernel.
+#![cfg_attr(not(target_arch = "x86_64"), allow(dead_code))]
+
 #[cfg(target_arch = "x86_64")]
 mod x86;
 
@@ -86,7 +89,6 @@ pub(in crate::kernels) struct Space {
 pub(in crate::kernels) struct Attend {
     /// Most rows of a call.
     pub(in crate::kernels) rows: usize,
-    #[cfg_attr(not(target_arch = "x86_64"), allow(dead_code))]
     run: unsafe fn(Rows<'_>, &mut Space),
 }
 

@@ -35,11 +35,16 @@ pub(super) struct Finish<'a> {
 #[derive(Clone, Copy)]
 pub(super) struct Channels<'a> {
     pub(super) scales: &'a [f32],
-    /// What the sums are too large by, activations being unsigned.
+    /// What the sums are too large by where activations are unsigned.
     pub(super) offsets: &'a [i32],
 }
 
 impl Finish<'_> {
+    /// For signed activations.
+    pub(super) fn without_offsets(self) -> Self {
+        Finish { channels: self.channels.map(|channels| Channels { offsets: &[], ..channels }), ..self }
+    }
+
     /// Outputs of a panel.
     fn width(&self) -> usize {
         if self.gated { HALF } else { WIDTH }

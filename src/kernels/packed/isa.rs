@@ -19,6 +19,8 @@ pub(super) struct Kernel {
     pub(super) per_step: usize,
     /// Words of a row in one step.
     pub(super) words: usize,
+    /// Whether integer activations are signed; else 128 is zero.
+    pub(super) signed: bool,
     /// Rows that may be read after the last.
     pub(super) spare_rows: usize,
     /// Converts a row of activations; returns its scale.
@@ -49,7 +51,7 @@ macro_rules! kernel {
                 unsafe { run::<$dot>(job, target, rows, panels) }
             }
             let spare_rows = if <$dot as Tile>::EVEN { 0 } else { <$dot as Tile>::ROWS };
-            Kernel { name: $name, per_step: $per_step, words: $words, spare_rows, convert, run: multiply }
+            Kernel { name: $name, per_step: $per_step, words: $words, signed: false, spare_rows, convert, run: multiply }
         };
     };
 }
@@ -99,6 +101,17 @@ mod x86 {
     );
 }
 
+#[cfg(target_arch = "aarch64")]
+mod arm {
+    use super::super::neon::{Bf16, Bytes, Dot, Neon, Widened};
+    use super::*;
+    kernel!(BF16 = "neon", 2, 2, lhs::widened, Neon<Widened>);
+    kernel!(BF16_DOT = "neon-bf16", 2, 1, lhs::pairs, Neon<Bf16>, "neon,bf16");
+    kernel!(INT8 = "neon", 4, 2, quantise::unsigned_pairs, Neon<Bytes>);
+    kernel!(BYTE_DOT = "neon-dotprod", 4, 1, quantise::signed_bytes, Neon<Dot>, "neon,dotprod");
+    pub(super) const INT8_DOT: Kernel = Kernel { signed: true, ..BYTE_DOT };
+}
+
 /// The kernels of a level: without its extensions, and with those that the machine has.
 pub(super) fn kernels(level: Level, format: WeightFormat) -> (Kernel, Option<Kernel>) {
     #[cfg(target_arch = "x86_64")]
@@ -122,6 +135,16 @@ pub(super) fn kernels(level: Level, format: WeightFormat) -> (Kernel, Option<Ker
         if level.is_avx2() {
             return (x86::BF16_AVX2, None);
         }
+    }
+    #[cfg(target_arch = "aarch64")]
+    if level.is_neon() {
+        use std::arch::is_aarch64_feature_detected;
+        return match format {
+            WeightFormat::Int8 => {
+                (arm::INT8, is_aarch64_feature_detected!("dotprod").then_some(arm::INT8_DOT))
+            }
+            _ => (arm::BF16, is_aarch64_feature_detected!("bf16").then_some(arm::BF16_DOT)),
+        };
     }
     let _ = level;
     (Kernel::portable(format), None)

@@ -4,7 +4,7 @@
 //! One layout serves every instruction set and both formats: panels of 32 output channels,
 //! `[panel][step][channel]` of 32-bit words, a word being the values of a channel for one step
 //! through the inner dimension: two bf16 or four signed bytes. That is what the dot-product
-//! instructions take (AVX512-BF16, VNNI, AMX), and what others widen in registers.
+//! instructions take (AVX512-BF16, VNNI, AMX, the dot products of NEON), and what others widen in registers.
 
 #[cfg(any(test, target_arch = "x86_64"))]
 mod amx;
@@ -18,6 +18,8 @@ mod gate;
 mod gemm;
 mod isa;
 mod lhs;
+#[cfg(target_arch = "aarch64")]
+pub(super) mod neon;
 mod panel;
 mod quantise;
 mod rows;
@@ -106,7 +108,8 @@ impl PackedWeight {
     /// `x W^T + b`: `x` is `[n, k]`, `bias` `[m]`, both f32 on the CPU; gives `[n, m]`.
     ///
     /// bf16: `x` is rounded to bf16 (to nearest even; NaN and infinities stay), products are summed in f32. Subnormal values of
-    /// `x` or the weight may count as zero: the AVX512-BF16 and AMX instructions read them so.
+    /// `x` or the weight may count as zero: the instructions of AVX512-BF16, AMX and FEAT_BF16 (Arm) read them so. The last also rounds
+    /// sums to odd rather than to nearest: by up to one unit in the last place of each.
     ///
     /// int8: each row of `x` is quantised as a channel of the weight is, by its own scale; sums are exact, so that every
     /// instruction set gives the same bits. A row with a value that is not finite gives NaN.
@@ -182,6 +185,7 @@ impl PackedWeight {
         finish: Finish<'_>,
     ) -> Vec<Vec<f32>> {
         let (k, m) = (self.panels.k, widths.iter().sum());
+        let finish = if kernel.signed { finish.without_offsets() } else { finish };
         let mut parts: Vec<Vec<f32>> = widths.iter().map(|width| Vec::with_capacity(n * width)).collect();
         let step = lhs::rows_at_once(kernel, k);
         for first in (0..n).step_by(step) {

@@ -62,26 +62,36 @@ pub(super) fn bytes(word: u32) -> [f32; 4] {
 }
 
 /// A row of activations as words of four unsigned bytes, and its scale.
+#[cfg(any(test, target_arch = "x86_64"))]
 #[inline(always)]
 pub(super) fn unsigned_bytes(words: &mut [u32], values: &[f32]) -> f32 {
     let (scale, by) = scale(values);
-    unsigned_bytes_by(words, values, by);
+    bytes_by(words, values, |value| unsigned(value, by));
     scale
 }
 
-/// The bytes of values that are multiplied by `by` first.
+/// The same with signed bytes.
+#[cfg(any(test, target_arch = "aarch64"))]
 #[inline(always)]
-fn unsigned_bytes_by(words: &mut [u32], values: &[f32], by: f32) {
+pub(super) fn signed_bytes(words: &mut [u32], values: &[f32]) -> f32 {
+    let (scale, by) = scale(values);
+    bytes_by(words, values, |value| nearest(value, by) as u8);
+    scale
+}
+
+/// Words of the bytes that `to_byte` gives.
+#[inline(always)]
+fn bytes_by(words: &mut [u32], values: &[f32], to_byte: impl Fn(f32) -> u8) {
     // By way of arrays of bytes, which the compiler narrows whole registers to.
     for (words, values) in words.chunks_mut(16).zip(values.chunks(64)) {
         let mut bytes = [0u8; 64];
         if let Ok(values) = <&[f32; 64]>::try_from(values) {
             for (byte, value) in bytes.iter_mut().zip(values) {
-                *byte = unsigned(*value, by);
+                *byte = to_byte(*value);
             }
         } else {
             for (byte, value) in bytes.iter_mut().zip(values) {
-                *byte = unsigned(*value, by);
+                *byte = to_byte(*value);
             }
         }
         for (word, bytes) in words.iter_mut().zip(bytes.as_chunks::<4>().0) {
@@ -128,7 +138,7 @@ pub(super) unsafe fn unsigned_bytes_at_once(words: &mut [u32], values: &[f32]) -
                 _mm_storeu_si128(words.as_mut_ptr().add(4 * i).cast(), bytes);
             }
         }
-        unsigned_bytes_by(last, rest, by);
+        bytes_by(last, rest, |value| unsigned(value, by));
         scale
     }
 }
@@ -172,17 +182,20 @@ mod tests {
     }
 
     #[test]
-    fn both_forms_of_a_row_hold_the_same_values() {
+    fn all_forms_of_a_row_hold_the_same_values() {
         for n in 1..40usize {
             let values: Vec<f32> = (0..n).map(|i| (i as f32 * 7.7).sin()).collect();
             let steps = n.div_ceil(4);
             let (mut single, mut pairs) = (vec![0u32; steps], vec![0u32; 2 * steps]);
+            let mut signed = vec![0u32; steps];
             let scale = unsigned_bytes(&mut single, &values);
             assert_eq!(scale, unsigned_pairs(&mut pairs, &values));
+            assert_eq!(scale, signed_bytes(&mut signed, &values));
             for i in 0..4 * steps {
                 let byte = single[i / 4] >> (8 * (i % 4)) & 0xff;
                 assert_eq!(byte, pairs[i / 4 * 2 + i % 2] >> (8 * (i & 2)) & 0xff);
                 let value = if i < n { values[i] } else { continue };
+                assert_eq!(signed[i / 4].to_le_bytes()[i % 4] as i8 as i32, byte as i32 - ZERO);
                 assert!(((byte as i32 - ZERO) as f32 * scale - value).abs() <= 0.5001 * scale);
             }
         }

@@ -121,21 +121,26 @@ const POINTERS: usize = 4;
 
 /// Brings a cache line into the second-level cache. Any address will do.
 #[inline(always)]
-fn fetch(at: *const u32) {
+pub(super) fn fetch(at: *const u32) {
     #[cfg(target_arch = "x86_64")]
     {
         use std::arch::x86_64::{_MM_HINT_T1, _mm_prefetch};
         // SAFETY: a hint, which reads nothing that the program sees.
         unsafe { _mm_prefetch::<_MM_HINT_T1>(at.cast()) };
     }
-    #[cfg(not(target_arch = "x86_64"))]
+    #[cfg(target_arch = "aarch64")]
+    // SAFETY: as above.
+    unsafe {
+        std::arch::asm!("prfm pldl2keep, [{}]", in(reg) at, options(nostack, preserves_flags, readonly))
+    };
+    #[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
     let _ = at;
 }
 
 /// The same pointer, of which the compiler knows nothing: else it works out each row's address from the first one's, at every step.
 #[inline(always)]
-fn opaque(pointer: *const u32) -> *const u32 {
-    #[cfg(target_arch = "x86_64")]
+pub(super) fn opaque(pointer: *const u32) -> *const u32 {
+    #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
     {
         let mut pointer = pointer;
         // SAFETY: no instruction at all.
@@ -145,7 +150,7 @@ fn opaque(pointer: *const u32) -> *const u32 {
         };
         pointer
     }
-    #[cfg(not(target_arch = "x86_64"))]
+    #[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
     pointer
 }
 
