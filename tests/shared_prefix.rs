@@ -16,6 +16,7 @@ use sdim::vlm::cache::KvCache;
 use sdim::vlm::decoder::{Context, Keep};
 use sdim::vlm::grid::Grid;
 use sdim::vlm::rope::{Position, RopeLayout};
+use sdim::vlm::sequences::Sequences;
 
 /// Largest difference, relative to the largest value.
 const TOLERANCE: f64 = 1e-4;
@@ -312,6 +313,36 @@ fn text_after_the_image_goes_on_at_its_larger_side_and_not_at_its_number_of_toke
     assert!(relative_difference(&together, &last(run(&right))) <= TOLERANCE);
     let counted = relative_difference(&together, &last(run(&by_hand(rows * cols))));
     assert!(counted > 10.0 * TOLERANCE, "token count as position: {counted:.1e}");
+}
+
+#[test]
+fn sequences_go_on_as_each_would_alone() {
+    let setup = Setup::new(&pointer_and_digits(), true, Some(0));
+    let suffixes: Vec<Tokens> = setup.queries(3).iter().map(|q| setup.suffix(q)).collect();
+    let read = |some: &[usize]| {
+        let some: Vec<Tokens> = some.iter().map(|&i| suffixes[i].clone()).collect();
+        let positions: Vec<Position> = some.iter().flat_map(|s| s.positions.clone()).collect();
+        let next = some.iter().map(|s| s.next_text(&setup.prefix.space)).collect();
+        let (decoder, shared) = (&setup.model.vlm.decoder, Some(&setup.prefix.cache));
+        Sequences::read(decoder, shared, &setup.embed(&some), &positions, next).unwrap()
+    };
+    let mut all = read(&[0, 1, 2]);
+    let ids = [3u32, 5, 4, 6];
+    all.go_on(&ids[..3]).unwrap();
+    all.keep(&[2, 0]).unwrap();
+    assert_eq!((all.count(), all.last().dim(0).unwrap()), (2, 2));
+    let before = all.last().clone();
+    all.go_on(&[ids[3], ids[0]]).unwrap();
+    for (row, (i, then)) in [(2, ids[3]), (0, ids[0])].into_iter().enumerate() {
+        let mut alone = read(&[i]);
+        for (id, together) in [(ids[i], &before), (then, all.last())] {
+            alone.go_on(&[id]).unwrap();
+            let difference = relative_difference(&together.narrow(0, row, 1).unwrap(), alone.last());
+            assert!(difference <= TOLERANCE, "sequence {i}: {difference:.1e}");
+        }
+    }
+    assert!(matches!(all.go_on(&ids), Err(sdim::Error::Argument { name: "token ids", .. })));
+    assert!(all.keep(&[2]).is_err());
 }
 
 #[test]

@@ -16,10 +16,11 @@ use sdim::system::{device, peak_rss_bytes};
 use sdim::vlm::QwenVl;
 use sdim::vlm::cache::KvCache;
 use sdim::vlm::config::VlmConfig;
-use sdim::vlm::decoder::{Context, Keep};
+use sdim::vlm::decoder::Keep;
 use sdim::vlm::grid::Grid;
 use sdim::vlm::prompt::positions;
 use sdim::vlm::rope::{Position, RopeLayout};
+use sdim::vlm::sequences::Sequences;
 use sdim::vlm::weights::Weights;
 use serde_json::json;
 use std::path::{Path, PathBuf};
@@ -147,18 +148,19 @@ impl Run {
         while left > 0 {
             let items = left.min(args.batch.max(1));
             left -= items;
-            let mut own = decoder.cache(items);
             let mut ids: Vec<u32> = (0..items * args.suffix_tokens).map(|i| 11 + (i % 13) as u32).collect();
-            let (mut at, mut length) = (next, args.suffix_tokens);
-            for _ in 0..args.digits {
-                let text = (0..items).flat_map(|_| (0..length).map(|i| Position::text(at + i as f32)));
-                let table = decoder.rope().table(&text.collect::<Vec<_>>(), &self.device)?;
-                let context = Context::Cached { shared: Some(prefix), own: &mut own };
-                let hidden = decoder.forward_keeping(&decoder.embed(&ids)?, &table, context, Keep::Last)?;
-                let logits = kernels::linear(&decoder.final_norm(&hidden)?, &rows, None)?;
+            let text =
+                (0..items).flat_map(|_| (0..args.suffix_tokens).map(|i| Position::text(next + i as f32)));
+            let after = vec![next + args.suffix_tokens as f32; items];
+            let (embedded, text) = (decoder.embed(&ids)?, text.collect::<Vec<_>>());
+            let mut sequences = Sequences::read(decoder, Some(prefix), &embedded, &text, after)?;
+            for digit in 0..args.digits {
+                if digit > 0 {
+                    sequences.go_on(&ids)?;
+                }
+                let logits = kernels::linear(sequences.last(), &rows, None)?;
                 let best = logits.argmax(1)?.to_vec1::<u32>()?;
                 ids = best.into_iter().map(|i| number_ids[i as usize]).collect();
-                (at, length) = (at + length as f32, 1);
             }
         }
         Ok(())

@@ -11,10 +11,9 @@ use super::settings::PixelReference;
 use crate::error::{Error, Result};
 use crate::kernels;
 use crate::model::SdimModel;
-use crate::vlm::cache::KvCache;
-use crate::vlm::decoder::{Context, Keep};
 use crate::vlm::rope::Position;
-use candle_core::{Device, Tensor};
+use crate::vlm::sequences::Sequences;
+use candle_core::Device;
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 
@@ -193,13 +192,9 @@ fn in_batches<T: Clone + Send>(
 pub(super) struct Batch<'a> {
     pub(super) model: &'a SdimModel,
     prefix: &'a Prefix,
-    own: KvCache,
-    /// Text position of the token that follows each item.
-    next: Vec<f32>,
     /// All ids of each item, those of the shared prefix first.
     suffixes: Vec<&'a [u32]>,
-    /// Final hidden state of each item's last token, normed: `[items, hidden]`.
-    pub(super) last: Tensor,
+    pub(super) sequences: Sequences<'a>,
 }
 
 impl<'a> Batch<'a> {
@@ -227,21 +222,12 @@ impl<'a> Batch<'a> {
                 model.vlm.embed_prompt(&ids, &marked.encode(model, &pixels)?)?
             }
         };
-        let mut own = model.vlm.decoder.cache(suffixes.len());
-        let last = read(model, prefix, embedded, &positions, &glimpses, &mut own)?;
-        Ok(Self {
-            model,
-            prefix,
-            own,
-            next: suffixes.iter().map(|s| s.next_text(&prefix.space)).collect(),
-            suffixes: suffixes.iter().map(|s| s.ids.as_slice()).collect(),
-            last,
-        })
-    }
-
-    /// Sequences in it.
-    pub(super) fn items(&self) -> usize {
-        self.own.items()
+        let embedded = model.add_glimpses(embedded, &[(&prefix.image, &glimpses)])?;
+        let next = suffixes.iter().map(|s| s.next_text(&prefix.space)).collect();
+        let shared = Some(&prefix.cache);
+        let sequences = Sequences::read(&model.vlm.decoder, shared, &embedded, &positions, next)?;
+        let suffixes = suffixes.iter().map(|s| s.ids.as_slice()).collect();
+        Ok(Self { model, prefix, suffixes, sequences })
     }
 
     /// Ids that an item has read, image placeholders included.
@@ -250,21 +236,10 @@ impl<'a> Batch<'a> {
         self.prefix.ids.iter().chain(opening).chain(self.suffixes[item]).copied()
     }
 
-    /// Reads one more text token per item.
-    pub(super) fn go_on(&mut self, ids: &[u32]) -> Result<()> {
-        let positions: Vec<Position> = self.next.iter().map(|&p| Position::text(p)).collect();
-        self.next.iter_mut().for_each(|p| *p += 1.0);
-        let embedded = self.model.vlm.decoder.embed(ids)?;
-        self.last = read(self.model, self.prefix, embedded, &positions, &[], &mut self.own)?;
-        Ok(())
-    }
-
     /// Goes on with these items only, in this order.
     pub(super) fn keep(&mut self, items: &[usize]) -> Result<()> {
-        self.own = self.own.select(items)?;
-        self.next = items.iter().map(|&i| self.next[i]).collect();
         self.suffixes = items.iter().map(|&i| self.suffixes[i]).collect();
-        Ok(())
+        self.sequences.keep(items)
     }
 
     /// What `read` makes of each item's logits of the numbers.
@@ -273,9 +248,10 @@ impl<'a> Batch<'a> {
         scratch: impl Fn() -> S + Sync,
         read: impl Fn(&mut S, &[f32]) -> T + Sync,
     ) -> Result<Vec<T>> {
-        let mut out = Vec::with_capacity(self.items());
-        for first in (0..self.items()).step_by(LOGITS) {
-            let some = self.last.narrow(0, first, LOGITS.min(self.items() - first))?;
+        let items = self.sequences.count();
+        let mut out = Vec::with_capacity(items);
+        for first in (0..items).step_by(LOGITS) {
+            let some = self.sequences.last().narrow(0, first, LOGITS.min(items - first))?;
             let logits = self.model.number_rows.linear(&some, None)?;
             let width = logits.dim(1)?.max(1);
             kernels::read(&logits.to_device(&Device::Cpu)?, |logits| {
@@ -298,11 +274,12 @@ fn forced_numbers(batch: &mut Batch) -> Result<Vec<Reading>> {
         }
         NumberFormat::Digits { decimals, integers } => (decimals, integers),
     };
-    let mut readers = vec![DigitReader::new(decimals, integers); batch.items()];
-    let mut alive = vec![true; batch.items()];
+    let items = batch.sequences.count();
+    let mut readers = vec![DigitReader::new(decimals, integers); items];
+    let mut alive = vec![true; items];
     loop {
         let rows = batch.of_numbers(|| (), |(), row| row.to_vec())?;
-        let mut ids = vec![numbers.ids[0]; batch.items()];
+        let mut ids = vec![numbers.ids[0]; items];
         let mut open = false;
         for (i, row) in rows.iter().enumerate() {
             if alive[i] {
@@ -317,24 +294,6 @@ fn forced_numbers(batch: &mut Batch) -> Result<Vec<Reading>> {
         if !open {
             return Ok(readers.iter().map(DigitReader::reading).collect());
         }
-        batch.go_on(&ids)?;
+        batch.sequences.go_on(&ids)?;
     }
-}
-
-/// Reads one more run of embedded tokens per item and returns the normed hidden state of each item's last token,
-/// `[items, hidden]`.
-fn read(
-    model: &SdimModel,
-    prefix: &Prefix,
-    embedded: Tensor,
-    positions: &[Position],
-    glimpses: &[Glimpse],
-    own: &mut KvCache,
-) -> Result<Tensor> {
-    let decoder = &model.vlm.decoder;
-    let embedded = model.add_glimpses(embedded, &[(&prefix.image, glimpses)])?;
-    let table = decoder.rope().table(positions, embedded.device())?;
-    let context = Context::Cached { shared: Some(&prefix.cache), own };
-    let last = decoder.forward_keeping(&embedded, &table, context, Keep::Last)?;
-    decoder.final_norm(&last)
 }

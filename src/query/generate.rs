@@ -63,8 +63,8 @@ impl<'a> Voice<'a> {
 
     /// Answers of all items of a batch, each until it ends itself or has its most tokens.
     pub(super) fn speak(&self, batch: &mut Batch) -> Result<Vec<Spoken>> {
-        let mut out = vec![Spoken::default(); batch.items()];
-        let mut alive: Vec<usize> = (0..batch.items()).collect();
+        let mut alive: Vec<usize> = (0..batch.sequences.count()).collect();
+        let mut out = vec![Spoken::default(); alive.len()];
         loop {
             let choices = self.choose(batch, &alive, &out)?;
             let (mut ids, mut keep) = (Vec::new(), Vec::new());
@@ -91,7 +91,7 @@ impl<'a> Voice<'a> {
                 batch.keep(&keep)?;
                 alive = keep.into_iter().map(|row| alive[row]).collect();
             }
-            batch.go_on(&ids)?;
+            batch.sequences.go_on(&ids)?;
         }
     }
 
@@ -102,7 +102,8 @@ impl<'a> Voice<'a> {
         let rows = (LOGITS / vocab).max(1);
         for first in (0..alive.len()).step_by(rows) {
             let count = rows.min(alive.len() - first);
-            let logits = decoder.logits(&batch.last.narrow(0, first, count)?)?.to_dtype(DType::F32)?;
+            let logits =
+                decoder.logits(&batch.sequences.last().narrow(0, first, count)?)?.to_dtype(DType::F32)?;
             let mut logits: Vec<f32> = logits.flatten_all()?.to_vec1()?;
             choices.par_extend(logits.par_chunks_mut(vocab).enumerate().map(|(row, logits)| {
                 if self.generation.repetition_penalty != 1.0 {

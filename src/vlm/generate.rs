@@ -2,9 +2,9 @@
 
 use super::QwenVl;
 use super::checkpoint::{CONFIG, Source};
-use super::decoder::Keep;
 use super::json::Node;
 use super::rope::Position;
+use super::sequences::Sequences;
 use crate::error::{Error, Result};
 use candle_core::{DType, Tensor};
 use candle_transformers::generation::{LogitsProcessor, Sampling};
@@ -128,13 +128,14 @@ impl QwenVl {
         options: &GenerateOptions,
         watch: &mut dyn FnMut(&Tensor) -> Result<()>,
     ) -> Result<Vec<u32>> {
-        let mut cache = self.decoder.cache(1);
         let mut sampler = LogitsProcessor::from_sampling(0, Sampling::ArgMax);
-        let mut seen = ids.to_vec();
-        let mut hidden = self.prefill(embedded, positions, &mut cache, Keep::Last)?;
-        let mut answer = Vec::new();
+        let mut sequence = Sequences::read(&self.decoder, None, embedded, positions, vec![next])?;
+        let mut answer: Vec<u32> = Vec::new();
         while answer.len() < options.max_new_tokens {
-            let logits = self.decoder.logits(&self.decoder.final_norm(&hidden)?)?.squeeze(0)?;
+            if let Some(&id) = answer.last() {
+                sequence.go_on(&[id])?;
+            }
+            let logits = self.decoder.logits(sequence.last())?.squeeze(0)?;
             let usable = options.usable_vocab.min(logits.dim(0)?);
             let logits = logits.narrow(0, 0, usable)?.to_dtype(DType::F32)?;
             watch(&logits)?;
@@ -142,20 +143,14 @@ impl QwenVl {
                 logits
             } else {
                 let mut values = logits.to_vec1::<f32>()?;
-                penalise(&mut values, seen.iter().copied(), options.repetition_penalty);
+                penalise(&mut values, ids.iter().chain(&answer).copied(), options.repetition_penalty);
                 Tensor::from_vec(values, usable, logits.device())?
             };
             let id = sampler.sample(&logits)?;
             if options.stop_ids.contains(&id) {
                 break;
             }
-            let position = Position::text(next + answer.len() as f32);
             answer.push(id);
-            if answer.len() == options.max_new_tokens {
-                break;
-            }
-            seen.push(id);
-            hidden = self.prefill(&self.decoder.embed(&[id])?, &[position], &mut cache, Keep::Last)?;
         }
         Ok(answer)
     }

@@ -20,6 +20,7 @@ pub mod prompt;
 mod raw;
 pub mod resize;
 pub mod rope;
+pub mod sequences;
 pub(crate) mod shards;
 mod stored;
 pub mod tokenizer;

@@ -1,0 +1,88 @@
+//! Sequences that are read together and go on together, token by token.
+
+use super::cache::KvCache;
+use super::decoder::{Context, Decoder, Keep};
+use super::rope::Position;
+use crate::error::{Error, Result};
+use candle_core::Tensor;
+
+/// Sequences of equal length, each of which sees one shared context and itself: answers under way.
+///
+/// Sequences do not see each other: each goes on as it would alone.
+pub struct Sequences<'a> {
+    decoder: &'a Decoder,
+    shared: Option<&'a KvCache>,
+    own: KvCache,
+    /// Text position of the token that follows each.
+    next: Vec<f32>,
+    last: Tensor,
+}
+
+impl<'a> Sequences<'a> {
+    /// Reads `embedded`, `[sequences * tokens, hidden]` with one position per row; `next` holds the text position that follows
+    /// each sequence. `shared` is what all of them see before themselves.
+    ///
+    /// # Errors
+    /// As [`Decoder::forward`].
+    pub fn read(
+        decoder: &'a Decoder,
+        shared: Option<&'a KvCache>,
+        embedded: &Tensor,
+        positions: &[Position],
+        next: Vec<f32>,
+    ) -> Result<Self> {
+        let mut own = decoder.cache(next.len());
+        let last = pass(decoder, shared, &mut own, embedded, positions)?;
+        Ok(Self { decoder, shared, own, next, last })
+    }
+
+    /// Number of sequences.
+    pub fn count(&self) -> usize {
+        self.next.len()
+    }
+
+    /// Hidden state of each sequence's last token after the final norm, `[sequences, hidden]`: what the next token is read from.
+    pub fn last(&self) -> &Tensor {
+        &self.last
+    }
+
+    /// Reads one more text token of each sequence.
+    ///
+    /// # Errors
+    /// [`Error::Argument`] on an id outside the vocabulary, or if there is not one for each sequence.
+    pub fn go_on(&mut self, ids: &[u32]) -> Result<()> {
+        if ids.len() != self.count() {
+            let expected = format!("{}, one for each sequence", self.count());
+            return Err(Error::argument("token ids", ids.len(), expected));
+        }
+        let positions: Vec<Position> = self.next.iter().map(|&p| Position::text(p)).collect();
+        self.last = pass(self.decoder, self.shared, &mut self.own, &self.decoder.embed(ids)?, &positions)?;
+        self.next.iter_mut().for_each(|p| *p += 1.0);
+        Ok(())
+    }
+
+    /// Goes on with these sequences only, in this order.
+    ///
+    /// # Errors
+    /// [`Error::Tensors`] if an index is out of range.
+    pub fn keep(&mut self, indices: &[usize]) -> Result<()> {
+        self.own = self.own.select(indices)?;
+        let rows: Vec<u32> = indices.iter().map(|&i| i as u32).collect();
+        self.last = self.last.index_select(&Tensor::from_vec(rows, indices.len(), self.last.device())?, 0)?;
+        self.next = indices.iter().map(|&i| self.next[i]).collect();
+        Ok(())
+    }
+}
+
+/// The normed hidden state of the last token of each sequence.
+fn pass(
+    decoder: &Decoder,
+    shared: Option<&KvCache>,
+    own: &mut KvCache,
+    embedded: &Tensor,
+    positions: &[Position],
+) -> Result<Tensor> {
+    let table = decoder.rope().table(positions, embedded.device())?;
+    let context = Context::Cached { shared, own };
+    decoder.final_norm(&decoder.forward_keeping(embedded, &table, context, Keep::Last)?)
+}
