@@ -2,6 +2,7 @@
 
 use super::QwenVl;
 use super::checkpoint::{CONFIG, Source};
+use super::decoder::Keep;
 use super::json::Node;
 use super::rope::Position;
 use super::sequences::Sequences;
@@ -129,7 +130,10 @@ impl QwenVl {
         watch: &mut dyn FnMut(&Tensor) -> Result<()>,
     ) -> Result<Vec<u32>> {
         let mut sampler = LogitsProcessor::from_sampling(0, Sampling::ArgMax);
-        let mut sequence = Sequences::read(&self.decoder, None, embedded, positions, vec![next])?;
+        let mut prompt = self.decoder.cache(1);
+        let hidden = self.prefill(embedded, positions, &mut prompt, Keep::Last)?;
+        // The answer has a cache of its own, since a cache is copied when it grows.
+        let mut sequence = Sequences::after(&self.decoder, &prompt, self.decoder.final_norm(&hidden)?, next);
         let mut answer: Vec<u32> = Vec::new();
         while answer.len() < options.max_new_tokens {
             if let Some(&id) = answer.last() {

@@ -36,6 +36,12 @@ impl<'a> Sequences<'a> {
         Ok(Self { decoder, shared, own, next, last })
     }
 
+    /// One sequence that goes on where `shared` ends and has read nothing of its own yet: `last` is the normed hidden state of
+    /// the last token there, `[1, hidden]`, and `next` the text position that follows.
+    pub fn after(decoder: &'a Decoder, shared: &'a KvCache, last: Tensor, next: f32) -> Self {
+        Self { decoder, shared: Some(shared), own: decoder.cache(1), next: vec![next], last }
+    }
+
     /// Number of sequences.
     pub fn count(&self) -> usize {
         self.next.len()
