@@ -3,6 +3,7 @@
 use super::attention_bf16::attend;
 use super::attention_composed::composed;
 use super::attention_cpu::Attention;
+use super::attention_shared::SharedKeys;
 use super::exec::{dims2, expect_dims, on_cpu};
 use super::packed::WeightFormat;
 use super::packed::attend::Attend;
@@ -74,7 +75,7 @@ pub enum Precision {
 /// `softmax(q k^T / sqrt(head_dim)) v` where each row sees what `layout` says.
 ///
 /// `q` is `[nq, heads * head_dim]`, `k` and `v` `[nk, kv_heads * head_dim]`; gives `[nq, heads *
-/// head_dim]`. With `shared` (two tensors like `k` and `v`, of any number of rows) the blocks' shared
+/// head_dim]`. With `shared` (like `k` and `v`, of any number of rows) the blocks' shared
 /// keys are its rows, otherwise rows of `k` and `v`. One softmax runs over shared and own keys
 /// together, so many short suffixes against one prefix cost one matrix product with the prefix, as
 /// in Hydragen (arXiv 2402.05099), and the result is exact. Differentiable in every tensor; the
@@ -86,7 +87,7 @@ pub fn attention(
     q: &Tensor,
     k: &Tensor,
     v: &Tensor,
-    shared: Option<(&Tensor, &Tensor)>,
+    shared: Option<&SharedKeys>,
     layout: &AttentionLayout,
 ) -> Result<Tensor> {
     let (nq, _) = dims2("q", q)?;
@@ -96,33 +97,33 @@ pub fn attention(
     expect_dims("k", k, &[nk, width])?;
     expect_dims("v", v, &[nk, width])?;
     let mut shared_rows = nk;
-    if let Some((sk, sv)) = shared {
+    let pair = shared.map(|shared| (shared.keys(), shared.values()));
+    if let Some((sk, sv)) = pair {
         shared_rows = dims2("shared keys", sk)?.0;
         expect_dims("shared keys", sk, &[shared_rows, width])?;
         expect_dims("shared values", sv, &[shared_rows, width])?;
     }
     check(layout, nq, nk, shared_rows)?;
-    if let Some((sk, sv)) = shared
+    if let Some((sk, sv)) = pair
         && (sk.track_op() || sv.track_op())
     {
         // Someone wants the extra pair's gradient: make it part of k and v.
         let (k, v) = (Tensor::cat(&[sk, k], 0)?, Tensor::cat(&[sv, v], 0)?);
         return attention(q, &k, &v, None, &layout.moved(shared_rows));
     }
-    let pair: Vec<&Tensor> = shared.map(|(sk, sv)| vec![sk, sv]).unwrap_or_default();
-    if !on_cpu(&[q, k, v]) || !on_cpu(&pair) {
-        return composed(q, k, v, shared, layout);
+    if !on_cpu(&[q, k, v]) || pair.is_some_and(|(sk, sv)| !on_cpu(&[sk, sv])) {
+        return composed(q, k, v, pair, layout);
     }
-    let shared = match shared {
-        Some((sk, sv)) => Some((sk.contiguous()?, sv.contiguous()?)),
-        None => None,
-    };
     if layout.precision == Precision::Bf16
         && let Some(kernel) = Attend::current()
         && ![q, k, v].iter().any(|t| t.track_op())
     {
-        return attend(kernel, [q, k, v], shared.as_ref(), layout);
+        return attend(kernel, [q, k, v], shared, layout);
     }
+    let shared = match pair {
+        Some((sk, sv)) => Some((sk.contiguous()?, sv.contiguous()?)),
+        None => None,
+    };
     let op = Attention::new(layout.clone(), shared);
     Ok(q.contiguous()?.apply_op3(&k.contiguous()?, &v.contiguous()?, op)?)
 }

@@ -2,8 +2,9 @@
 //! scores stay in the first-level cache.
 
 use super::attention::AttentionLayout;
-use super::attention_plan::{Own, Plan, SHORT};
+use super::attention_plan::{KeySet, Own, Plan, SHORT};
 use super::attention_rows::{self, row_dots, row_sums};
+use super::attention_shared::SharedKeys;
 use super::attention_tile::Data;
 use super::exec::{read2, read3, tensor, written};
 use super::level::Level;
@@ -19,28 +20,47 @@ const _: () = assert!(SHORT <= GIVEN);
 pub(super) fn attend(
     kernel: Attend,
     [q, k, v]: [&Tensor; 3],
-    shared: Option<&(Tensor, Tensor)>,
+    shared: Option<&SharedKeys>,
     layout: &AttentionLayout,
 ) -> Result<Tensor> {
     let plan = Plan::new(layout, shared.is_some());
     let run = |data: Data<'_>| {
-        let packed = pack(layout, &plan, data);
+        // The set of all shared keys, which is packed once for many calls.
+        let whole = shared.and_then(|shared| {
+            let rows = 0..shared.keys().dims().first().copied()?;
+            let set = plan.sets.iter().position(|set| set.extra && set.rows == rows)?;
+            let pack = || pack(layout, &[&plan.sets[set]], data);
+            Some((set, shared.packed(layout.kv_heads, pack)))
+        });
+        let kept = whole.as_ref().map_or(usize::MAX, |(set, _)| *set);
+        let others: Vec<&KeySet> =
+            plan.sets.iter().enumerate().filter(|(i, _)| *i != kept).map(|(_, set)| set).collect();
+        let others = pack(layout, &others, data);
+        let mut others = others.chunks(layout.kv_heads);
+        let packed = (0..plan.sets.len()).map(|set| match &whole {
+            Some((kept, packed)) if *kept == set => packed,
+            _ => others.next().unwrap_or_default(),
+        });
+        let packed: Vec<&[PackedKeys]> = packed.collect();
         let call = Call { kernel, layout, plan: &plan, data, packed: &packed, level: Level::current() };
         Ok(call.run())
     };
     let out = read3(q, k, v, |q, k, v| match shared {
         None => run(Data { q, k, v, extra: None }),
-        Some((sk, sv)) => read2(sk, sv, |sk, sv| run(Data { q, k, v, extra: Some((sk, sv)) })),
+        Some(shared) => {
+            let run = |sk: &[f32], sv: &[f32]| run(Data { q, k, v, extra: Some((sk, sv)) });
+            read2(shared.keys(), shared.values(), run)
+        }
     })?;
     Ok(tensor(out, q.shape().clone())?)
 }
 
-/// Every key set for every head: `[set * kv_heads + head]`.
-fn pack(layout: &AttentionLayout, plan: &Plan, data: Data<'_>) -> Vec<PackedKeys> {
+/// Packs key sets for every head: `[set * kv_heads + head]`.
+fn pack(layout: &AttentionLayout, sets: &[&KeySet], data: Data<'_>) -> Vec<PackedKeys> {
     let AttentionLayout { kv_heads, head_dim, .. } = *layout;
     let width = kv_heads * head_dim;
     let one = |i: usize| {
-        let set = &plan.sets[i / kv_heads];
+        let set = sets[i / kv_heads];
         let (k, v) = match data.extra {
             Some(pair) if set.extra => pair,
             _ => (data.k, data.v),
@@ -48,7 +68,7 @@ fn pack(layout: &AttentionLayout, plan: &Plan, data: Data<'_>) -> Vec<PackedKeys
         let from = set.rows.start * width + i % kv_heads * head_dim;
         PackedKeys::new(&k[from..], &v[from..], width, set.rows.len(), head_dim)
     };
-    (0..plan.sets.len() * kv_heads).into_par_iter().map(one).collect()
+    (0..sets.len() * kv_heads).into_par_iter().map(one).collect()
 }
 
 /// Buffers of one thread.
@@ -72,7 +92,8 @@ struct Call<'a> {
     layout: &'a AttentionLayout,
     plan: &'a Plan,
     data: Data<'a>,
-    packed: &'a [PackedKeys],
+    /// Of each set, for every head.
+    packed: &'a [&'a [PackedKeys]],
     level: Level,
 }
 
@@ -125,7 +146,7 @@ impl Call<'_> {
                 *to = from * scale;
             }
         }
-        let set = |set: usize, seen| Part { keys: &self.packed[set * kv_heads + head], seen };
+        let set = |set: usize, seen| Part { keys: &self.packed[set][head], seen };
         let shared = plan.shared.map(|shared| set(shared, &s.seen[0]));
         let own = match plan.own {
             Own::Set { set: own, .. } => Some(set(own, &s.seen[1])),

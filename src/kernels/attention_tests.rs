@@ -3,6 +3,7 @@
 use super::attention::{AttentionLayout, Block, Precision, attention};
 use super::attention_bf16::attend;
 use super::attention_composed::composed;
+use super::attention_shared::SharedKeys;
 use super::packed::attend::Attend;
 use super::testing::{
     at_every_level, check_gradients, close, gradients, random, same_on_any_thread_count, values,
@@ -114,7 +115,8 @@ fn an_extra_pair_is_seen_and_has_gradients() {
     let l = layout(4, 2, 8, vec![block(0..50, 0..21, 0, 2, 2, true), block(50..90, 5..21, 50, 40, 40, true)]);
     let [q, k, v] = qkv(90, 90, &l);
     let inputs = [q, k, v, random(&[21, 16], 7), random(&[21, 16], 8)];
-    let run = |t: &[Tensor]| attention(&t[0], &t[1], &t[2], Some((&t[3], &t[4])), &l);
+    let pair = |t: &[Tensor]| SharedKeys::new(t[0].clone(), t[1].clone());
+    let run = |t: &[Tensor]| attention(&t[0], &t[1], &t[2], Some(&pair(&t[3..])), &l);
     let reference = |t: &[Tensor]| composed(&t[0], &t[1], &t[2], Some((&t[3], &t[4])), &l);
     let expected = gradients(&inputs, reference);
     at_every_level(|| {
@@ -123,7 +125,8 @@ fn an_extra_pair_is_seen_and_has_gradients() {
             close(g, e, 1e-4);
         }
         // The pair as constants: the other gradients are the same.
-        let constant = |t: &[Tensor]| attention(&t[0], &t[1], &t[2], Some((&inputs[3], &inputs[4])), &l);
+        let shared = pair(&inputs[3..]);
+        let constant = |t: &[Tensor]| attention(&t[0], &t[1], &t[2], Some(&shared), &l);
         for (g, e) in gradients(&inputs[..3], constant).iter().zip(&expected) {
             close(g, e, 1e-4);
         }
@@ -224,13 +227,25 @@ fn in_bf16_it_is_the_same_to_three_digits() {
 fn in_bf16_the_extra_pair_is_seen() {
     let l = layout(4, 2, 8, vec![block(0..50, 0..21, 0, 2, 2, true), block(50..90, 5..21, 50, 40, 40, true)]);
     let t = qkv(90, 90, &l);
-    let (sk, sv) = (random(&[21, 16], 7), random(&[21, 16], 8));
-    let exact = plainly(&t, Some((&sk, &sv)), &l);
+    let shared = SharedKeys::new(random(&[21, 16], 7), random(&[21, 16], 8));
+    let exact = plainly(&t, Some((shared.keys(), shared.values())), &l);
+    // The second layout has other heads of the same width: what is packed for the first must not be taken for it.
+    let mut other = l.clone();
+    (other.heads, other.kv_heads, other.head_dim) = (8, 4, 4);
+    let exact_other = plainly(&t, Some((shared.keys(), shared.values())), &other);
     for kernel in Attend::every() {
-        let found = attend(kernel, [&t[0], &t[1], &t[2]], Some(&(sk.clone(), sv.clone())), &l).unwrap();
-        for (f, e) in values(&found).iter().zip(&exact) {
-            assert!((f64::from(*f) - e).abs() <= 8e-3, "{f}, expected {e}");
+        for (l, exact) in [(&l, &exact), (&other, &exact_other), (&l, &exact)] {
+            let found = attend(kernel, [&t[0], &t[1], &t[2]], Some(&shared), l).unwrap();
+            for (f, e) in values(&found).iter().zip(exact) {
+                assert!((f64::from(*f) - e).abs() <= 8e-3, "{f}, expected {e}");
+            }
         }
+        let mut packed = 0;
+        shared.packed(2, || {
+            packed += 1;
+            Vec::new()
+        });
+        assert_eq!(packed, 0, "kept from the first call on");
     }
 }
 

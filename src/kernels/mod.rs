@@ -21,6 +21,7 @@ mod attention_composed;
 mod attention_cpu;
 mod attention_plan;
 mod attention_rows;
+mod attention_shared;
 #[cfg(test)]
 mod attention_tests;
 mod attention_tile;
@@ -46,6 +47,7 @@ pub use activation::{gelu_erf, swiglu};
 pub use adamw::adamw_step;
 pub use add::add;
 pub use attention::{AttentionLayout, Block, Precision, attention};
+pub use attention_shared::SharedKeys;
 pub use bins::{BinStats, bin_stats};
 pub use conv::conv3x3;
 pub(crate) use exec::{in_pool, read};

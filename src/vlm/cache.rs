@@ -1,6 +1,7 @@
 //! Keys and values of tokens that were already read. A cache is an argument of a forward pass, never a field of a layer.
 
 use crate::error::Result;
+use crate::kernels::SharedKeys;
 use candle_core::Tensor;
 
 /// Keys and values per layer, of `items` sequences of equal length that do not see each other.
@@ -11,7 +12,7 @@ use candle_core::Tensor;
 pub struct KvCache {
     items: usize,
     len: usize,
-    layers: Vec<Option<(Tensor, Tensor)>>,
+    layers: Vec<Option<SharedKeys>>,
 }
 
 impl KvCache {
@@ -41,19 +42,19 @@ impl KvCache {
     }
 
     /// Keys and values of a layer, each `[items * len, kv_heads * head_dim]`; `None` while empty.
-    pub fn layer(&self, layer: usize) -> Option<(&Tensor, &Tensor)> {
-        self.layers.get(layer)?.as_ref().map(|(k, v)| (k, v))
+    pub fn layer(&self, layer: usize) -> Option<&SharedKeys> {
+        self.layers.get(layer)?.as_ref()
     }
 
     /// Appends `[items * new, width]` to each sequence of a layer and returns all of its keys and values.
     /// [`KvCache::advance`] makes the new length count, once all layers have appended.
     pub(crate) fn append(&mut self, layer: usize, k: &Tensor, v: &Tensor) -> Result<(Tensor, Tensor)> {
-        let joined = match &self.layers[layer] {
+        let (k, v) = match &self.layers[layer] {
             None => (k.clone(), v.clone()),
-            Some((old_k, old_v)) => (self.join(old_k, k)?, self.join(old_v, v)?),
+            Some(old) => (self.join(old.keys(), k)?, self.join(old.values(), v)?),
         };
-        self.layers[layer] = Some(joined.clone());
-        Ok(joined)
+        self.layers[layer] = Some(SharedKeys::new(k.clone(), v.clone()));
+        Ok((k, v))
     }
 
     fn join(&self, old: &Tensor, new: &Tensor) -> Result<Tensor> {
@@ -75,7 +76,7 @@ impl KvCache {
             Ok(t.index_select(&index, 0)?)
         };
         let layers = self.layers.iter().map(|layer| match layer {
-            Some((k, v)) => Ok(Some((pick(k)?, pick(v)?))),
+            Some(old) => Ok(Some(SharedKeys::new(pick(old.keys())?, pick(old.values())?))),
             None => Ok(None),
         });
         Ok(Self { items: items.len(), len: self.len, layers: layers.collect::<Result<_>>()? })

@@ -9,7 +9,7 @@ use super::matrix::Matrix;
 use super::rope::{MRope, RopeLayout, RopeTable};
 use super::weights::Weights;
 use crate::error::{Error, Result};
-use crate::kernels::{self, AttentionLayout, Block, Precision};
+use crate::kernels::{self, AttentionLayout, Block, Precision, SharedKeys};
 use candle_core::Tensor;
 
 struct DecoderLayer {
@@ -95,7 +95,7 @@ impl DecoderLayer {
 struct Keys<'a> {
     k: Tensor,
     v: Tensor,
-    shared: Option<(&'a Tensor, &'a Tensor)>,
+    shared: Option<&'a SharedKeys>,
 }
 
 impl<'a> Keys<'a> {

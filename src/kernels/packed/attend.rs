@@ -18,6 +18,7 @@ pub(in crate::kernels) const GIVEN: usize = 16;
 const PANEL_WORDS: usize = WIDTH / 2;
 
 /// Keys and values of one head, for queries that see all of them or the first so many.
+#[derive(Debug)]
 pub(in crate::kernels) struct PackedKeys {
     /// Keys as output channels: scores are a product with them.
     keys: Panels,
