@@ -25,24 +25,25 @@ pub(super) fn attend(
 ) -> Result<Tensor> {
     let plan = Plan::new(layout, shared.is_some());
     let run = |data: Data<'_>| {
+        let level = Level::current();
         // The set of all shared keys, which is packed once for many calls.
         let whole = shared.and_then(|shared| {
             let rows = 0..shared.keys().dims().first().copied()?;
             let set = plan.sets.iter().position(|set| set.extra && set.rows == rows)?;
-            let pack = || pack(layout, &[&plan.sets[set]], data);
+            let pack = || pack(level, layout, &[&plan.sets[set]], data);
             Some((set, shared.packed(layout.kv_heads, pack)))
         });
         let kept = whole.as_ref().map_or(usize::MAX, |(set, _)| *set);
         let others: Vec<&KeySet> =
             plan.sets.iter().enumerate().filter(|(i, _)| *i != kept).map(|(_, set)| set).collect();
-        let others = pack(layout, &others, data);
+        let others = pack(level, layout, &others, data);
         let mut others = others.chunks(layout.kv_heads);
         let packed = (0..plan.sets.len()).map(|set| match &whole {
             Some((kept, packed)) if *kept == set => packed,
             _ => others.next().unwrap_or_default(),
         });
         let packed: Vec<&[PackedKeys]> = packed.collect();
-        let call = Call { kernel, layout, plan: &plan, data, packed: &packed, level: Level::current() };
+        let call = Call { kernel, layout, plan: &plan, data, packed: &packed, level };
         Ok(call.run())
     };
     let out = read3(q, k, v, |q, k, v| match shared {
@@ -56,7 +57,7 @@ pub(super) fn attend(
 }
 
 /// Packs key sets for every head: `[set * kv_heads + head]`.
-fn pack(layout: &AttentionLayout, sets: &[&KeySet], data: Data<'_>) -> Vec<PackedKeys> {
+fn pack(level: Level, layout: &AttentionLayout, sets: &[&KeySet], data: Data<'_>) -> Vec<PackedKeys> {
     let AttentionLayout { kv_heads, head_dim, .. } = *layout;
     let width = kv_heads * head_dim;
     let one = |i: usize| {
@@ -66,7 +67,7 @@ fn pack(layout: &AttentionLayout, sets: &[&KeySet], data: Data<'_>) -> Vec<Packe
             _ => (data.k, data.v),
         };
         let from = set.rows.start * width + i % kv_heads * head_dim;
-        PackedKeys::new(&k[from..], &v[from..], width, set.rows.len(), head_dim)
+        PackedKeys::new(level, &k[from..], &v[from..], width, set.rows.len(), head_dim)
     };
     (0..sets.len() * kv_heads).into_par_iter().map(one).collect()
 }

@@ -14,12 +14,15 @@ pub fn keep_freed_memory() -> bool {
         const M_TRIM_THRESHOLD: i32 = -1;
         const M_TOP_PAD: i32 = -2;
         const M_MMAP_MAX: i32 = -4;
+        const M_ARENA_MAX: i32 = -8;
         unsafe extern "C" {
             fn mallopt(param: i32, value: i32) -> i32;
         }
         // SAFETY: `mallopt` takes two ints, may be called at any time, and is in every glibc.
         unsafe {
-            mallopt(M_MMAP_MAX, 0) == 1
+            // One arena: those of other threads hold no more than 64 MB, and are given back.
+            mallopt(M_ARENA_MAX, 1) == 1
+                && mallopt(M_MMAP_MAX, 0) == 1
                 && mallopt(M_TRIM_THRESHOLD, i32::MAX) == 1
                 && mallopt(M_TOP_PAD, 64 << 20) == 1
         }

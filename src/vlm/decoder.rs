@@ -261,14 +261,17 @@ impl Decoder {
             }
             Context::Cached { own, .. } => self.kept(keep, table, &layout, own.items(), rows)?,
         };
-        let mut x = embedded.clone();
-        for (i, layer) in self.layers.iter().enumerate() {
-            let kept = kept.as_ref().filter(|_| i + 1 == self.layers.len());
-            x = layer.forward(&x, table, &layout, kept, i, &mut context)?;
-            if let Some(t) = trace.as_deref_mut() {
-                t.push(x.clone());
+        let x = kernels::in_pool(|| -> Result<Tensor> {
+            let mut x = embedded.clone();
+            for (i, layer) in self.layers.iter().enumerate() {
+                let kept = kept.as_ref().filter(|_| i + 1 == self.layers.len());
+                x = layer.forward(&x, table, &layout, kept, i, &mut context)?;
+                if let Some(t) = trace.as_deref_mut() {
+                    t.push(x.clone());
+                }
             }
-        }
+            Ok(x)
+        })?;
         if let Context::Cached { own, .. } = context {
             let items = own.items();
             own.advance(rows / items);

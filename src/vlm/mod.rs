@@ -30,6 +30,7 @@ pub mod weights;
 pub use answer::{Answer, AnswerOptions, ChatModel};
 
 use crate::error::Result;
+use crate::kernels;
 use cache::KvCache;
 use candle_core::Tensor;
 use config::VlmConfig;
@@ -65,7 +66,7 @@ impl QwenVl {
     /// # Errors
     /// [`crate::Error::Tensors`] if the rows are not those of the grids.
     pub fn encode(&self, patches: &Tensor, grids: &[Grid]) -> Result<Tensor> {
-        self.vision.encode(&self.vision.patch_embed.forward(patches)?, grids)
+        kernels::in_pool(|| self.vision.encode(&self.vision.patch_embed.forward(patches)?, grids))
     }
 
     /// Embeds a prompt and puts the image tokens in the places of the placeholders, in order: `[ids, hidden]`.

@@ -6,8 +6,9 @@
 #[cfg(target_arch = "x86_64")]
 mod x86;
 
+use super::super::level::Level;
 use super::panel::{Panels, WIDTH, Words};
-use super::words::{bf16, from_f32};
+use super::words::{pair_neighbours, pair_rows};
 
 /// Key sets that one row sees, at most: shared ones and its item's own.
 pub(in crate::kernels) const PARTS: usize = 2;
@@ -30,25 +31,28 @@ pub(in crate::kernels) struct PackedKeys {
 
 impl PackedKeys {
     /// Packs `n` rows of `head_dim` that start every `stride` elements.
-    pub(in crate::kernels) fn new(k: &[f32], v: &[f32], stride: usize, n: usize, head_dim: usize) -> Self {
+    pub(in crate::kernels) fn new(
+        level: Level,
+        k: &[f32],
+        v: &[f32],
+        stride: usize,
+        n: usize,
+        head_dim: usize,
+    ) -> Self {
         let (keys, _) = Panels::build(n, head_dim, 2, |row, words| {
-            from_f32(&k[row * stride..row * stride + head_dim], words);
+            pair_neighbours(level, &k[row * stride..row * stride + head_dim], words);
         });
         let steps = n.div_ceil(WIDTH) * WIDTH / 2;
         let mut values = Words::zeros(head_dim.div_ceil(WIDTH) * WIDTH * steps);
+        let zeros = [0f32; WIDTH];
         for (p, panel) in values.get_mut().chunks_exact_mut((steps * WIDTH).max(1)).enumerate() {
             let columns = p * WIDTH..head_dim.min((p + 1) * WIDTH);
+            let row = |key: usize| match key < n {
+                true => &v[key * stride + columns.start..key * stride + columns.end],
+                false => &zeros[..columns.len()],
+            };
             for (pair, words) in panel.chunks_exact_mut(WIDTH).take(n.div_ceil(2)).enumerate() {
-                let row = |key: usize| &v[key * stride + columns.start..key * stride + columns.end];
-                let first = row(2 * pair);
-                for (word, value) in words.iter_mut().zip(first) {
-                    *word = bf16(*value);
-                }
-                if 2 * pair + 1 < n {
-                    for (word, value) in words.iter_mut().zip(row(2 * pair + 1)) {
-                        *word |= bf16(*value) << 16;
-                    }
-                }
+                pair_rows(level, row(2 * pair), row(2 * pair + 1), words);
             }
         }
         PackedKeys { keys, values, steps }
@@ -98,7 +102,6 @@ impl Attend {
     pub(in crate::kernels) fn current() -> Option<Attend> {
         #[cfg(target_arch = "x86_64")]
         {
-            use super::super::level::Level;
             let level = Level::current();
             if level.is_avx512() && is_x86_feature_detected!("avx512bf16") {
                 return Some(if level.is_amx() { x86::AMX } else { x86::DOT });

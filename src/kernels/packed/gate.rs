@@ -13,7 +13,7 @@ use candle_core::Tensor;
 #[derive(Debug)]
 pub struct PackedGate {
     /// Channels by 16 of the gate and 16 of the up projection in turn.
-    both: PackedWeight,
+    pub(super) both: PackedWeight,
     bias: Option<Vec<f32>>,
     outputs: usize,
 }
@@ -73,9 +73,13 @@ impl PackedGate {
         let (n, _) = dims2("x", x)?;
         expect_dims("x", x, &[n, self.both.panels.k])?;
         expect_cpu_f32("x", x)?;
-        let finish = Finish { gated: true, ..self.both.finish(self.bias.as_deref()) };
+        let finish = self.finish();
         let mut parts = read(x, |x| Ok(self.both.product(kernel, x, n, &[self.outputs], finish)))?;
         Ok(tensor(parts.pop().unwrap_or_default(), (n, self.outputs))?)
+    }
+
+    pub(super) fn finish(&self) -> Finish<'_> {
+        Finish { gated: true, ..self.both.finish(self.bias.as_deref()) }
     }
 }
 

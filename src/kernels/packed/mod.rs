@@ -18,6 +18,7 @@ mod gate;
 mod gemm;
 mod isa;
 mod lhs;
+mod mlp;
 #[cfg(target_arch = "aarch64")]
 pub(super) mod neon;
 mod panel;
@@ -42,6 +43,7 @@ use isa::Kernel;
 use lhs::Left;
 use panel::Panels;
 pub use rows::Rows;
+use std::mem::MaybeUninit;
 
 #[cfg(target_arch = "x86_64")]
 pub(super) use amx_unit::usable as amx_usable;
@@ -184,26 +186,40 @@ impl PackedWeight {
         widths: &[usize],
         finish: Finish<'_>,
     ) -> Vec<Vec<f32>> {
+        let mut parts: Vec<Vec<f32>> = widths.iter().map(|width| Vec::with_capacity(n * width)).collect();
+        let room = parts.iter_mut().zip(widths);
+        let mut room: Vec<_> = room.map(|(p, width)| &mut p.spare_capacity_mut()[..n * width]).collect();
+        self.product_into(kernel, x, &mut room, widths, finish);
+        for (part, width) in parts.iter_mut().zip(widths) {
+            // SAFETY: every element was written.
+            unsafe { part.set_len(n * width) };
+        }
+        parts
+    }
+
+    /// Writes every element of [`PackedWeight::product`]'s parts.
+    fn product_into(
+        &self,
+        kernel: Kernel,
+        x: &[f32],
+        parts: &mut [&mut [MaybeUninit<f32>]],
+        widths: &[usize],
+        finish: Finish<'_>,
+    ) {
         let (k, m) = (self.panels.k, widths.iter().sum());
         let finish = if kernel.signed { finish.without_offsets() } else { finish };
-        let mut parts: Vec<Vec<f32>> = widths.iter().map(|width| Vec::with_capacity(n * width)).collect();
+        let n = parts.iter().zip(widths).find(|(_, w)| **w > 0).map_or(0, |(part, w)| part.len() / w);
         let step = lhs::rows_at_once(kernel, k);
         for first in (0..n).step_by(step) {
             let rows = first..n.min(first + step);
             let room = parts.iter_mut().zip(widths);
-            let mut room: Vec<_> =
-                room.map(|(p, w)| &mut p.spare_capacity_mut()[rows.start * w..rows.end * w]).collect();
+            let mut room: Vec<_> = room.map(|(p, w)| &mut p[rows.start * w..rows.end * w]).collect();
             let residual = finish.residual.map(|r| &r[rows.start * m..rows.end * m]);
             let left = Left::new(kernel, &x[rows.start * k..rows.end * k], rows.len(), k);
             let finish = Finish { residual, ..finish };
             Job { kernel, left: &left, panels: &self.panels, m, finish }.run(&mut room);
             left.recycle();
         }
-        for (part, width) in parts.iter_mut().zip(widths) {
-            // SAFETY: the jobs' rows are all rows, and a job writes every element of its own.
-            unsafe { part.set_len(n * width) };
-        }
-        parts
     }
 
     fn finish<'a>(&'a self, bias: Option<&'a [f32]>) -> Finish<'a> {

@@ -1,5 +1,7 @@
 //! The 32-bit words of packed values, and bf16, whose 16 bits are the upper half of an f32.
 
+use super::super::level::per_level;
+
 /// `value` rounded to the nearest bf16, ties to even. A NaN stays one; what is too large becomes infinite.
 #[inline(always)]
 pub(super) fn bf16(value: f32) -> u32 {
@@ -35,6 +37,28 @@ pub(super) fn from_f32(values: &[f32], words: &mut [u32]) {
     }
     if let (Some(last), &[low]) = (words.get_mut(pairs.len()), rest) {
         *last = bf16(low);
+    }
+}
+
+per_level!(
+    /// [`from_f32`] at a level.
+    fn pair_neighbours(values: &[f32], words: &mut [u32]) = pair_neighbours_body
+);
+
+#[inline(always)]
+fn pair_neighbours_body<const LANES: usize>(values: &[f32], words: &mut [u32]) {
+    from_f32(values, words);
+}
+
+per_level!(
+    /// Words of a value of `low` and one of `high`, rounded.
+    fn pair_rows(low: &[f32], high: &[f32], words: &mut [u32]) = pair_rows_body
+);
+
+#[inline(always)]
+fn pair_rows_body<const LANES: usize>(low: &[f32], high: &[f32], words: &mut [u32]) {
+    for (word, (low, high)) in words.iter_mut().zip(low.iter().zip(high)) {
+        *word = bf16(*low) | bf16(*high) << 16;
     }
 }
 

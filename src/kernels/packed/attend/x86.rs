@@ -5,6 +5,7 @@ use super::super::amx_unit;
 use super::super::dot_bf16::x86::Bf16;
 use super::super::panel::{HALF, STEP_BLOCK};
 use super::super::tile::{Operands, Tile, by_registers};
+use super::super::words::from_f32;
 use super::*;
 use std::arch::x86_64::*;
 

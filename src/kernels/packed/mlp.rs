@@ -1,0 +1,128 @@
+//! A SwiGLU network at once, so that what lies between its two products is small and soon read again.
+
+use super::isa::Kernel;
+use super::{Finish, PackedGate, PackedWeight, expect_cpu_f32, read_some};
+use crate::error::{Error, Result};
+use crate::kernels::exec::{dims2, expect_dims, read2, tensor};
+use candle_core::Tensor;
+use std::cell::Cell;
+
+/// Bytes of the gate's outputs at once: what stays in the last-level cache until it is read, and what a thread keeps.
+const AT_ONCE: usize = 8 << 20;
+/// Rows at once, at least: fewer would wait for the weights, which are read anew for them.
+const FEWEST: usize = 192;
+
+thread_local!(
+    /// The gate's outputs of this thread's last network.
+    static SPARE: Cell<Vec<f32>> = const { Cell::new(Vec::new()) }
+);
+
+impl PackedGate {
+    /// `r + (h D^T + d)`, where `h` is [`PackedGate::apply`] of `x` `[n, k]`, `down` `D` `[o, m]`, `bias` `d` `[o]` and `residual` `r`
+    /// `[n, o]`, f32 on the CPU: the same values as by one product after the other. `h` is never there as a whole.
+    ///
+    /// # Errors
+    /// [`Error::Argument`] for another shape, type or device.
+    pub fn apply_onto(
+        &self,
+        x: &Tensor,
+        down: &PackedWeight,
+        bias: Option<&Tensor>,
+        residual: &Tensor,
+    ) -> Result<Tensor> {
+        let ((m, k), (o, inputs)) = (self.dims(), down.dims());
+        if inputs != m {
+            return Err(Error::argument("inputs of the down projection", inputs, m.to_string()));
+        }
+        let (n, _) = dims2("x", x)?;
+        let known =
+            [("x", Some(x), &[n, k][..]), ("bias", bias, &[o]), ("residual", Some(residual), &[n, o])];
+        for (name, tensor, dims) in known {
+            if let Some(tensor) = tensor {
+                expect_dims(name, tensor, dims)?;
+                expect_cpu_f32(name, tensor)?;
+            }
+        }
+        let out = read2(x, residual, |x, residual| {
+            read_some(bias, |bias| {
+                Ok(self.onto(x, down, Finish { residual: Some(residual), ..down.finish(bias) }, n))
+            })
+        })?;
+        Ok(tensor(out, (n, o))?)
+    }
+
+    fn onto(&self, x: &[f32], down: &PackedWeight, finish: Finish<'_>, n: usize) -> Vec<f32> {
+        let ((m, k), (o, _)) = (self.dims(), down.dims());
+        let kernels = [self.format(), down.format()].map(Kernel::current);
+        let mut out = Vec::with_capacity(n * o);
+        let room = &mut out.spare_capacity_mut()[..n * o];
+        let mut gated = SPARE.take();
+        let step = rows_at_once(n, m);
+        for first in (0..n).step_by(step) {
+            let rows = first..n.min(first + step);
+            gated.clear();
+            gated.reserve(rows.len() * m);
+            let inner = &mut gated.spare_capacity_mut()[..rows.len() * m];
+            let x = &x[rows.start * k..rows.end * k];
+            self.both.product_into(kernels[0], x, &mut [inner], &[m], self.finish());
+            // SAFETY: every element was written.
+            unsafe { gated.set_len(rows.len() * m) };
+            let residual = finish.residual.map(|r| &r[rows.start * o..rows.end * o]);
+            let room = &mut room[rows.start * o..rows.end * o];
+            down.product_into(kernels[1], &gated, &mut [room], &[o], Finish { residual, ..finish });
+        }
+        SPARE.set(gated);
+        // SAFETY: the chunks are all rows, every element of which was written.
+        unsafe { out.set_len(n * o) };
+        out
+    }
+}
+
+/// Rows of a chunk of `n`, of about the same size each, where the gate has `m` outputs.
+fn rows_at_once(n: usize, m: usize) -> usize {
+    let most = (AT_ONCE / (m * size_of::<f32>()).max(1)).max(FEWEST);
+    n.div_ceil(n.div_ceil(most).max(1)).max(1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::tests::packed_as;
+    use super::super::{Rows, WeightFormat};
+    use super::*;
+    use crate::kernels::testing::{random, same_on_any_thread_count, values};
+
+    fn network(format: WeightFormat, k: usize, m: usize, o: usize) -> (PackedGate, PackedWeight) {
+        let [gate, up, down] = [(m, k, 1), (m, k, 2), (o, m, 3)].map(|(m, k, s)| values(&random(&[m, k], s)));
+        let rows = |w| (Rows::f32(w, m, k).unwrap(), None);
+        (PackedGate::new(format, rows(&gate), rows(&up)).unwrap(), packed_as(format, &down, o, m))
+    }
+
+    #[test]
+    fn it_is_one_product_after_the_other() {
+        for format in [WeightFormat::Bf16, WeightFormat::Int8] {
+            // The last is cut into chunks.
+            for (n, k, m, o) in [(1, 5, 3, 2), (0, 4, 8, 4), (70, 33, 40, 65), (450, 4, 10_923, 3)] {
+                let (gate, down) = network(format, k, m, o);
+                let (x, residual, bias) = (random(&[n, k], 4), random(&[n, o], 5), random(&[o], 6));
+                let found = gate.apply_onto(&x, &down, Some(&bias), &residual).unwrap();
+                let inner = gate.apply(&x).unwrap();
+                let expected = down.linear_onto(&inner, Some(&bias), &residual).unwrap();
+                assert_eq!(found.dims(), [n, o]);
+                assert_eq!(values(&found), values(&expected), "{format} {n}");
+            }
+        }
+        assert_eq!(rows_at_once(450, 10_923), 150);
+        assert_eq!((rows_at_once(0, 3), rows_at_once(100, 0)), (1, 100));
+    }
+
+    #[test]
+    fn threads_do_not_matter_and_misfits_are_errors() {
+        let (gate, down) = network(WeightFormat::Bf16, 20, 70, 9);
+        let (x, residual) = (random(&[130, 20], 4), random(&[130, 9], 5));
+        same_on_any_thread_count(|| vec![gate.apply_onto(&x, &down, None, &residual).unwrap()]);
+        assert!(gate.apply_onto(&residual, &down, None, &residual).is_err());
+        assert!(gate.apply_onto(&x, &down, None, &x).is_err());
+        assert!(gate.apply_onto(&x, &down, Some(&random(&[8], 1)), &residual).is_err());
+        assert!(gate.apply_onto(&x, &network(WeightFormat::Bf16, 20, 71, 9).1, None, &residual).is_err());
+    }
+}
