@@ -15,6 +15,10 @@ const STEPS: usize = 512;
 pub(super) const TASK_ROWS: usize = 96;
 /// Panels of a task, at most: what of the sums stays in the second-level cache between blocks of steps.
 const PANELS: usize = 8;
+/// Tasks of a product, if it is large enough: so many that no thread waits long for another one's last.
+const TASKS: usize = 64;
+/// Steps of panels by rows in a task, at least: some ten microseconds.
+const LEAST: usize = 1 << 17;
 /// Most rows of a tile.
 const TALLEST: usize = 32;
 
@@ -152,11 +156,15 @@ impl Job<'_> {
         let target = Target(&parts);
         let count = m.div_ceil(self.finish.width());
         assert!(count * WIDTH * self.panels.steps <= self.panels.words().len());
-        let (across, down) = (count.div_ceil(PANELS), n.div_ceil(TASK_ROWS));
-        (0..across * down).into_par_iter().for_each(|task| {
-            let (row, panel) = (task / across * TASK_ROWS, task % across * PANELS);
+        let down = n.div_ceil(TASK_ROWS);
+        let least = LEAST.div_ceil((n.div_ceil(down) * self.panels.steps).max(1));
+        let wide = (count * down / TASKS).max(least).clamp(1, PANELS);
+        let across = count.div_ceil(wide);
+        // One by one: rayon would give a thread a quarter of them at once, which the other could not take over.
+        (0..across * down).into_par_iter().with_max_len(1).for_each(|task| {
+            let (row, panel) = (task / across * TASK_ROWS, task % across * wide);
             let rows = row..n.min(row + TASK_ROWS);
-            let panels = panel..count.min(panel + PANELS);
+            let panels = panel..count.min(panel + wide);
             // SAFETY: a `Kernel` exists only where the CPU has its instructions; its panels and rows were made
             // for it; no two tasks share both a row and a panel.
             unsafe { (self.kernel.run)(self, target, rows, panels) }
