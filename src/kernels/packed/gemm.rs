@@ -4,7 +4,7 @@ use super::super::math::sigmoid;
 use super::isa::Kernel;
 use super::lhs::Left;
 use super::panel::{HALF, Panels, STEP_BLOCK, WIDTH};
-use super::tile::{AHEAD, Operands, Tile};
+use super::tile::{AHEAD, Operands, Tile, fetch, fetch_to_write};
 use rayon::prelude::*;
 use std::mem::MaybeUninit;
 use std::ops::Range;
@@ -19,6 +19,8 @@ const PANELS: usize = 8;
 const TASKS: usize = 64;
 /// Steps of panels by rows in a task, at least: some ten microseconds.
 const LEAST: usize = 1 << 17;
+/// Values of a cache line.
+const LINE: usize = 16;
 /// Most rows of a tile.
 const TALLEST: usize = 32;
 
@@ -137,7 +139,23 @@ unsafe impl Send for Target<'_> {}
 // SAFETY: as above.
 unsafe impl Sync for Target<'_> {}
 
+impl Part {
+    /// Which of some columns of the product are its own: the first, and how many.
+    #[inline(always)]
+    fn of(&self, columns: &Range<usize>) -> (usize, usize) {
+        let start = columns.start.max(self.first);
+        (start, columns.end.min(self.first + self.columns).saturating_sub(start))
+    }
+}
+
 impl Job<'_> {
+    /// The product's columns that a panel gives.
+    #[inline(always)]
+    fn columns(&self, panel: usize) -> Range<usize> {
+        let width = self.finish.width();
+        panel * width..self.m.min((panel + 1) * width)
+    }
+
     /// Writes every element of the results, `[n, columns]` each, which share the product's `m` columns in turn.
     pub(super) fn run(&self, results: &mut [&mut [MaybeUninit<f32>]]) {
         let (n, m) = (self.left.n, self.m);
@@ -218,6 +236,9 @@ pub(super) unsafe fn run<T: Tile>(
                     .as_ptr_range()
                     .end
                     .wrapping_add((weight.steps - steps.len()) * WIDTH + t * AHEAD * steps.len());
+                if block + 1 == blocks {
+                    announce(job, target, row..row + count, panel);
+                }
                 // SAFETY: the caller's promise for the CPU; the operands and the sums are long enough.
                 unsafe { T::multiply(&mut state, count, operands, sums.as_mut_ptr()) };
                 if block + 1 == blocks {
@@ -245,6 +266,27 @@ fn operands<T: Tile>(left: &Left, rows: Range<usize>, right: &[u32], steps: &Ran
     }
 }
 
+/// Asks for the cache lines that [`finish`] will use, while there is a tile to multiply until then.
+#[inline(always)]
+fn announce(job: &Job<'_>, target: Target<'_>, rows: Range<usize>, panel: usize) {
+    let columns = job.columns(panel);
+    for row in rows {
+        for part in target.0 {
+            let (start, count) = part.of(&columns);
+            let to = part.data.wrapping_add(row * part.columns + start - part.first);
+            for line in (0..count).step_by(LINE) {
+                fetch_to_write(to.wrapping_add(line).cast());
+            }
+        }
+        if let Some(residual) = job.finish.residual {
+            let from = residual.as_ptr().wrapping_add(row * job.m + columns.start);
+            for line in (0..columns.len()).step_by(LINE) {
+                fetch(from.wrapping_add(line).cast());
+            }
+        }
+    }
+}
+
 /// Writes the rows of a panel from the sums.
 ///
 /// # Safety
@@ -258,8 +300,7 @@ unsafe fn finish<T: Tile>(
     panel: usize,
     sums: &mut [u32],
 ) {
-    let width = job.finish.width();
-    let columns = panel * width..job.m.min((panel + 1) * width);
+    let columns = job.columns(panel);
     let rows = sums.as_chunks_mut::<WIDTH>().0;
     for (r, sums) in rows.iter_mut().enumerate() {
         by.row(sums, job.left.scales[row + r]);
@@ -278,8 +319,7 @@ unsafe fn finish<T: Tile>(
         }
     }
     for part in target.0 {
-        let start = columns.start.max(part.first);
-        let count = columns.end.min(part.first + part.columns).saturating_sub(start);
+        let (start, count) = part.of(&columns);
         for (r, sums) in rows.iter().enumerate().filter(|_| count > 0) {
             let sums = &sums[start - columns.start..][..count];
             // SAFETY: the caller's promise; the columns are some of the part's; the bits are those of f32.

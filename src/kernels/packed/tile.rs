@@ -137,6 +137,24 @@ pub(super) fn fetch(at: *const u32) {
     let _ = at;
 }
 
+/// Brings a cache line near, to be written. Any address will do.
+#[inline(always)]
+pub(super) fn fetch_to_write(at: *const u32) {
+    #[cfg(target_arch = "x86_64")]
+    {
+        use std::arch::x86_64::{_MM_HINT_ET0, _mm_prefetch};
+        // SAFETY: a hint, which changes nothing that the program sees.
+        unsafe { _mm_prefetch::<_MM_HINT_ET0>(at.cast()) };
+    }
+    #[cfg(target_arch = "aarch64")]
+    // SAFETY: as above.
+    unsafe {
+        std::arch::asm!("prfm pstl1keep, [{}]", in(reg) at, options(nostack, preserves_flags, readonly))
+    };
+    #[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
+    let _ = at;
+}
+
 /// The same pointer, of which the compiler knows nothing: else it works out each row's address from the first one's, at every step.
 #[inline(always)]
 pub(super) fn opaque(pointer: *const u32) -> *const u32 {
