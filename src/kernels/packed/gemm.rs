@@ -19,6 +19,8 @@ const PANELS: usize = 8;
 const TASKS: usize = 64;
 /// Steps of panels by rows in a task, at least: some ten microseconds.
 const LEAST: usize = 1 << 17;
+/// Steps of a tile that takes longer than it takes to ask for its results' lines.
+const LONG: usize = 256;
 /// Values of a cache line.
 const LINE: usize = 16;
 /// Most rows of a tile.
@@ -236,7 +238,7 @@ pub(super) unsafe fn run<T: Tile>(
                     .as_ptr_range()
                     .end
                     .wrapping_add((weight.steps - steps.len()) * WIDTH + t * AHEAD * steps.len());
-                if block + 1 == blocks {
+                if block + 1 == blocks && weight.steps >= LONG {
                     announce(job, target, row..row + count, panel);
                 }
                 // SAFETY: the caller's promise for the CPU; the operands and the sums are long enough.
