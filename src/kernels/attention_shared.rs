@@ -5,7 +5,8 @@ use candle_core::Tensor;
 use std::sync::{Arc, OnceLock};
 
 /// Keys and values that come before the own ones of many calls of [`super::attention()`]: those of a prefix. In bf16 they are
-/// packed at the first call, and kept so for the others.
+/// packed at the first call, and kept so for the others: half as much memory again as the tensors hold in f32. The tensors must not be changed in
+/// place (candle's `slice_set`) once they are here.
 #[derive(Debug, Clone)]
 pub struct SharedKeys {
     keys: Tensor,
@@ -15,7 +16,7 @@ pub struct SharedKeys {
 }
 
 impl SharedKeys {
-    /// Keys and values, both `[n, kv_heads * head_dim]`.
+    /// Keys and values, both `[n, kv_heads * head_dim]`; other shapes are errors of [`super::attention()`].
     pub fn new(keys: Tensor, values: Tensor) -> Self {
         Self { keys, values, packed: OnceLock::new() }
     }

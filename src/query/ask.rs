@@ -238,8 +238,9 @@ impl<'a> Batch<'a> {
 
     /// Goes on with these items only, in this order.
     pub(super) fn keep(&mut self, items: &[usize]) -> Result<()> {
+        self.sequences.keep(items)?;
         self.suffixes = items.iter().map(|&i| self.suffixes[i]).collect();
-        self.sequences.keep(items)
+        Ok(())
     }
 
     /// What `read` makes of each item's logits of the numbers.

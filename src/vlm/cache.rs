@@ -67,8 +67,11 @@ impl KvCache {
     /// The cache of these items only, in this order.
     ///
     /// # Errors
-    /// [`crate::Error::Tensors`] if an index is out of range.
+    /// [`crate::Error::Argument`] if an index is out of range.
     pub fn select(&self, items: &[usize]) -> Result<Self> {
+        if let Some(item) = items.iter().find(|&&item| item >= self.items) {
+            return Err(crate::Error::argument("item of a cache", item, format!("below {}", self.items)));
+        }
         let rows = items.iter().flat_map(|&i| (i * self.len..(i + 1) * self.len).map(|r| r as u32));
         let rows: Vec<u32> = rows.collect();
         let pick = |t: &Tensor| -> Result<Tensor> {

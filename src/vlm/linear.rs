@@ -21,9 +21,11 @@ impl<'w> Found<'w> {
         let lora = Lora::new(weights, name, inputs, outputs)?;
         let weight = weights.raw(&format!("{name}.weight"), [outputs, inputs])?;
         let (weight, lora) = match (lora, weights.lora().mode) {
-            (Some(lora), LoraMode::Merge) => {
+            // What is absent stays so: the load fails at its end.
+            (Some(lora), LoraMode::Merge) if !matches!(weight, Raw::Absent(_)) => {
                 (Raw::Tensor((weight.f32(weights.device())? + lora.delta()?)?), None)
             }
+            (_, LoraMode::Merge) => (weight, None),
             (lora, _) => (weight, lora),
         };
         let bias = if bias { Some(weights.get(&format!("{name}.bias"), &[outputs])?) } else { None };

@@ -55,6 +55,7 @@ impl<'a> Sequences<'a> {
     /// Reads one more text token of each sequence.
     ///
     /// # Errors
+    /// After an error in the middle of a pass the sequences cannot go on.
     /// [`Error::Argument`] on an id outside the vocabulary, or if there is not one for each sequence.
     pub fn go_on(&mut self, ids: &[u32]) -> Result<()> {
         if ids.len() != self.count() {
@@ -70,12 +71,13 @@ impl<'a> Sequences<'a> {
     /// Goes on with these sequences only, in this order.
     ///
     /// # Errors
-    /// [`Error::Tensors`] if an index is out of range.
+    /// [`Error::Argument`] if an index is out of range; nothing has changed then.
     pub fn keep(&mut self, indices: &[usize]) -> Result<()> {
-        self.own = self.own.select(indices)?;
+        let own = self.own.select(indices)?;
         let rows: Vec<u32> = indices.iter().map(|&i| i as u32).collect();
-        self.last = self.last.index_select(&Tensor::from_vec(rows, indices.len(), self.last.device())?, 0)?;
-        self.next = indices.iter().map(|&i| self.next[i]).collect();
+        let last = self.last.index_select(&Tensor::from_vec(rows, indices.len(), self.last.device())?, 0)?;
+        self.next = indices.iter().filter_map(|&i| self.next.get(i).copied()).collect();
+        (self.own, self.last) = (own, last);
         Ok(())
     }
 }

@@ -37,9 +37,13 @@ pub enum WeightFormat {
 
 impl WeightFormat {
     /// What this machine multiplies best without losing what a published checkpoint holds: bf16 on a CPU with
-    /// instructions for it (AVX512-BF16, AMX), f32 elsewhere.
+    /// instructions for it (AVX512-BF16, AMX), f32 elsewhere. On 64-bit Arm it is f32 even with FEAT_BF16, whose speed was not measured.
     pub fn native(device: &Device) -> Self {
-        if device.is_cpu() && isa::multiplies_bf16(Level::current()) { Self::Bf16 } else { Self::F32 }
+        if device.is_cpu() && cfg!(target_arch = "x86_64") && isa::multiplies_bf16(Level::current()) {
+            Self::Bf16
+        } else {
+            Self::F32
+        }
     }
 }
 

@@ -4,7 +4,7 @@ use super::super::math::sigmoid;
 use super::isa::Kernel;
 use super::lhs::Left;
 use super::panel::{HALF, Panels, STEP_BLOCK, WIDTH};
-use super::tile::{AHEAD, Operands, Tile, fetch, fetch_to_write};
+use super::tile::{AHEAD, Operands, Tile, fetch, fetch_near};
 use rayon::prelude::*;
 use std::mem::MaybeUninit;
 use std::ops::Range;
@@ -277,7 +277,7 @@ fn announce(job: &Job<'_>, target: Target<'_>, rows: Range<usize>, panel: usize)
             let (start, count) = part.of(&columns);
             let to = part.data.wrapping_add(row * part.columns + start - part.first);
             for line in (0..count).step_by(LINE) {
-                fetch_to_write(to.wrapping_add(line).cast());
+                fetch_near(to.wrapping_add(line).cast());
             }
         }
         if let Some(residual) = job.finish.residual {

@@ -90,8 +90,10 @@ pub(super) unsafe fn pairs_at_once(words: &mut [u32], x: &[f32]) -> f32 {
 /// Rounded to bf16, but as f32: two words to a step.
 #[inline(always)]
 pub(super) fn widened(words: &mut [u32], x: &[f32]) -> f32 {
-    for (word, x) in words.iter_mut().zip(x) {
+    let (values, padding) = words.split_at_mut(x.len().min(words.len()));
+    for (word, x) in values.iter_mut().zip(x) {
         *word = bf16(*x) << 16;
     }
+    padding.fill(0);
     1.0
 }

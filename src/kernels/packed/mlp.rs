@@ -5,22 +5,26 @@ use super::{Finish, PackedGate, PackedWeight, expect_cpu_f32, read_some};
 use crate::error::{Error, Result};
 use crate::kernels::exec::{dims2, expect_dims, read2, tensor};
 use candle_core::Tensor;
-use std::cell::Cell;
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
-/// Bytes of the gate's outputs at once, which a thread keeps. Less would have both weights read more often: pieces of 8 MB, which stay in
+/// Bytes of the gate's outputs at once, which stay allocated. Less would have both weights read more often: pieces of 8 MB, which stay in
 /// the last-level cache, were slower by a tenth at the 3B shapes.
 const AT_ONCE: usize = 64 << 20;
 /// Rows at once, at least.
 const FEWEST: usize = 192;
 
-thread_local!(
-    /// The gate's outputs of this thread's last network.
-    static SPARE: Cell<Vec<f32>> = const { Cell::new(Vec::new()) }
-);
+/// The gate's outputs of the last network: one buffer in the process.
+static SPARE: Mutex<Vec<f32>> = Mutex::new(Vec::new());
+
+fn spare() -> MutexGuard<'static, Vec<f32>> {
+    SPARE.lock().unwrap_or_else(PoisonError::into_inner)
+}
 
 impl PackedGate {
     /// `r + (h D^T + d)`, where `h` is [`PackedGate::apply`] of `x` `[n, k]`, `down` `D` `[o, m]`, `bias` `d` `[o]` and `residual` `r`
-    /// `[n, o]`, f32 on the CPU: the same values as by one product after the other.
+    /// `[n, o]`, f32 on the CPU: the same values as by one product after the other. No gradient flows, not through `residual` either.
+    ///
+    /// `h` is made in a buffer of 64 MB at most (or 192 rows), which the process keeps for the next call.
     ///
     /// # Errors
     /// [`Error::Argument`] for another shape, type or device.
@@ -57,12 +61,12 @@ impl PackedGate {
         let kernels = [self.format(), down.format()].map(Kernel::current);
         let mut out = Vec::with_capacity(n * o);
         let room = &mut out.spare_capacity_mut()[..n * o];
-        let mut gated = SPARE.take();
+        let mut gated = std::mem::take(&mut *spare());
         let step = rows_at_once(n, m);
         for first in (0..n).step_by(step) {
             let rows = first..n.min(first + step);
             gated.clear();
-            gated.reserve(rows.len() * m);
+            gated.reserve_exact(rows.len() * m);
             let inner = &mut gated.spare_capacity_mut()[..rows.len() * m];
             let x = &x[rows.start * k..rows.end * k];
             self.both.product_into(kernels[0], x, &mut [inner], &[m], self.finish());
@@ -72,7 +76,7 @@ impl PackedGate {
             let room = &mut room[rows.start * o..rows.end * o];
             down.product_into(kernels[1], &gated, &mut [room], &[o], Finish { residual, ..finish });
         }
-        SPARE.set(gated);
+        *spare() = gated;
         // SAFETY: the chunks are all rows, every element of which was written.
         unsafe { out.set_len(n * o) };
         out

@@ -123,6 +123,7 @@ impl PackedWeight {
     }
 
     /// `r + (x W^T + b)`, rounded as the sum of the two is: `residual` `r` is `[n, m]`, the rest as for [`PackedWeight::linear`].
+    /// No gradient flows, not through `residual` either.
     ///
     /// # Errors
     /// [`Error::Argument`] for another shape, type or device.
@@ -163,7 +164,8 @@ impl PackedWeight {
                 expect_cpu_f32(name, tensor)?;
             }
         }
-        if widths.iter().try_fold(0usize, |sum, &width| sum.checked_add(width)).is_none_or(|sum| sum > m) {
+        let wanted = widths.iter().try_fold(0usize, |sum, &width| sum.checked_add(width));
+        if wanted.is_none_or(|wanted| wanted > m || residual.is_some() && wanted < m) {
             return Err(Error::argument("widths", format!("{widths:?}"), format!("{m} outputs at most")));
         }
         let parts = read(x, |x| {

@@ -43,6 +43,10 @@ fn nearest(value: f32, by: f32) -> i32 {
 /// A row of a weight as words of four signed bytes. Returns its scale and the sum of its bytes.
 pub(super) fn weight_row(values: &[f32], words: &mut [u32]) -> (f32, i32) {
     let (scale, by) = scale(values);
+    if scale.is_nan() {
+        words.fill(0);
+        return (scale, 0);
+    }
     let mut sum = 0;
     for (word, values) in words.iter_mut().zip(values.chunks(4)) {
         let mut bytes = [0u8; 4];
@@ -207,9 +211,10 @@ mod tests {
         if !is_x86_feature_detected!("avx512bw") {
             return;
         }
-        for n in (0..70usize).chain([128, 200, 1000]) {
+        for (n, times) in (0..70usize).chain([128, 200, 1000]).flat_map(|n| [1.0, 0.0, 1e-38].map(|t| (n, t)))
+        {
             // Halves among them: ties.
-            let values: Vec<f32> = (0..n).map(|i| (i * 37 % 255) as f32 / 2.0 - 63.5).collect();
+            let values: Vec<f32> = (0..n).map(|i| times * ((i * 37 % 255) as f32 / 2.0 - 63.5)).collect();
             let (mut plain, mut fast) = (vec![7u32; n.div_ceil(4)], vec![9u32; n.div_ceil(4)]);
             let scale = unsigned_bytes(&mut plain, &values);
             // SAFETY: the CPU has AVX-512, as was seen above.
@@ -237,6 +242,9 @@ mod tests {
                 values[at] = 1.0;
             }
         }
+        let mut words = [7u32; 3];
+        let (scale_of_row, sum) = weight_row(&[f32::NAN; 12], &mut words);
+        assert!(scale_of_row.is_nan() && (sum, words) == (0, [0; 3]));
         assert_eq!(scale(&[0.0, -0.0, 1e-39]), (0.0, 0.0));
         assert_eq!(scale(&[]), (0.0, 0.0));
     }

@@ -27,8 +27,9 @@ impl<'a> Rows<'a> {
     /// `m * k` values.
     ///
     /// # Errors
-    /// [`Error::BufferLength`] where there are more or fewer.
+    /// [`Error::BufferLength`] where there are more or fewer; [`Error::Argument`] where `k` is 0 and `m` above 2^32.
     pub fn f32(values: &'a [f32], m: usize, k: usize) -> Result<Self> {
+        expect_rows(m, k)?;
         expect_length("weight", values.len(), m.checked_mul(k))?;
         Ok(Rows { values: Values::F32(values), m, k })
     }
@@ -36,8 +37,9 @@ impl<'a> Rows<'a> {
     /// `m * k` little-endian bf16, as a safetensors file holds them; any alignment.
     ///
     /// # Errors
-    /// [`Error::BufferLength`] where there are more or fewer than two bytes for each.
+    /// [`Error::BufferLength`] where there are more or fewer than two bytes for each; [`Error::Argument`] where `k` is 0 and `m` above 2^32.
     pub fn bf16(bytes: &'a [u8], m: usize, k: usize) -> Result<Self> {
+        expect_rows(m, k)?;
         expect_length("bf16 weight, in bytes", bytes.len(), m.checked_mul(k).and_then(|n| n.checked_mul(2)))?;
         Ok(Rows { values: Values::Bf16(bytes), m, k })
     }
@@ -53,6 +55,18 @@ impl<'a> Rows<'a> {
             Values::Bf16(bytes) => Values::Bf16(&bytes[2 * row * self.k..2 * (row + 1) * self.k]),
         }
     }
+}
+
+/// Without inputs, no length tells whether the outputs can be.
+fn expect_rows(m: usize, k: usize) -> Result<()> {
+    if k == 0 && m > u32::MAX as usize {
+        return Err(Error::argument(
+            "outputs of a weight without inputs",
+            m,
+            format!("at most {}", u32::MAX),
+        ));
+    }
+    Ok(())
 }
 
 fn expect_length(what: &'static str, found: usize, expected: Option<usize>) -> Result<()> {

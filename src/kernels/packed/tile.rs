@@ -137,14 +137,14 @@ pub(super) fn fetch(at: *const u32) {
     let _ = at;
 }
 
-/// Brings a cache line near, to be written. Any address will do.
+/// Brings a cache line into the first-level cache. Any address will do.
 #[inline(always)]
-pub(super) fn fetch_to_write(at: *const u32) {
+pub(super) fn fetch_near(at: *const u32) {
     #[cfg(target_arch = "x86_64")]
     {
-        use std::arch::x86_64::{_MM_HINT_ET0, _mm_prefetch};
+        use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
         // SAFETY: a hint, which changes nothing that the program sees.
-        unsafe { _mm_prefetch::<_MM_HINT_ET0>(at.cast()) };
+        unsafe { _mm_prefetch::<_MM_HINT_T0>(at.cast()) };
     }
     #[cfg(target_arch = "aarch64")]
     // SAFETY: as above.
