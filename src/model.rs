@@ -203,6 +203,7 @@ impl SdimModel {
     pub fn fold(mut self) -> Result<Self> {
         if let Some(injection) = &mut self.injection {
             injection.fusion.fold()?;
+            injection.patch_embed.fold()?;
         }
         Ok(self)
     }

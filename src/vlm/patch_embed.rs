@@ -11,8 +11,10 @@ use candle_core::Tensor;
 pub struct PatchEmbed {
     /// `[hidden, channels * frames * side * side]`
     weight: Tensor,
-    /// `[hidden, channels * side * side]`: the frames summed, for an image that is the same in each frame.
-    still: Tensor,
+    /// `[hidden, channels * side * side]`: the frames summed, for an image that is the same in each frame. `None` until
+    /// [`PatchEmbed::fold`]: a sum kept while the kernel is trained would stay at the kernel's first values.
+    folded: Option<Tensor>,
+    frames: usize,
     channels: usize,
     patch: usize,
     merge: usize,
@@ -28,11 +30,28 @@ impl PatchEmbed {
         let kernel = weights.get(&format!("{name}.weight"), &[config.hidden_size, c, t, p, p])?;
         Ok(Self {
             weight: kernel.reshape((config.hidden_size, config.patch_len()))?,
-            still: kernel.sum(2)?.reshape((config.hidden_size, c * p * p))?,
+            folded: None,
+            frames: t,
             channels: c,
             patch: p,
             merge: config.merge_size,
         })
+    }
+
+    /// Sums the kernel over its frames once and for all, for inference.
+    ///
+    /// # Errors
+    /// [`crate::Error::Tensors`] if a tensor operation fails.
+    pub fn fold(&mut self) -> Result<()> {
+        self.folded = Some(self.frame_sum()?);
+        Ok(())
+    }
+
+    /// The kernel summed over its frames, `[hidden, channels * side * side]`.
+    fn frame_sum(&self) -> Result<Tensor> {
+        let (hidden, area) = (self.weight.dim(0)?, self.patch * self.patch);
+        let kernel = self.weight.reshape((hidden, self.channels, self.frames, area))?;
+        Ok(kernel.sum(2)?.reshape((hidden, self.channels * area))?)
     }
 
     /// `[patches, patch_len]`, the rows of the preprocessor, to `[patches, hidden]`.
@@ -57,6 +76,9 @@ impl PatchEmbed {
             .permute(vec![0, 3, 1, 4, 6, 2, 5])?
             .contiguous()?
             .reshape((grid.patches(), self.channels * p * p))?;
-        kernels::linear(&rows_of_patches, &self.still, None)
+        match &self.folded {
+            Some(kernel) => kernels::linear(&rows_of_patches, kernel, None),
+            None => kernels::linear(&rows_of_patches, &self.frame_sum()?, None),
+        }
     }
 }
