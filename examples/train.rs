@@ -1,6 +1,6 @@
 //! Trains the tiny checkpoint on procedural scenes.
 //!
-//! `cargo run --release --example train -- --out DIR [--steps N] [--resume]`
+//! `cargo run --release --example train -- --out DIR [--steps N] [--from DIR | --resume]`
 //!
 //! Writes DIR/{config,preprocessor_config,sdim,tokenizer}.json, model.safetensors (what `--model DIR` loads),
 //! trainer.safetensors (what `--resume` continues from), train.json (the configuration), curve.csv, and DIR/best: the
@@ -37,6 +37,9 @@ struct Args {
     /// Labels: `dense` ground truth, or `sparse` measurements held back from the prompt.
     #[arg(long, default_value = "dense")]
     labels: String,
+    /// Start from the weights of this checkpoint instead of random ones.
+    #[arg(long, value_name = "DIR", conflicts_with = "resume")]
+    from: Option<PathBuf>,
     /// Continue from DIR/trainer.safetensors.
     #[arg(long)]
     resume: bool,
@@ -92,6 +95,9 @@ fn main() -> anyhow::Result<()> {
     let mut trainer = Trainer::new(config.clone(), &Settings::tiny())?;
     if args.resume {
         trainer.resume(&args.out)?;
+    }
+    if let Some(dir) = &args.from {
+        trainer.start_from(dir)?;
     }
     std::fs::write(args.out.join("train.json"), serde_json::to_string_pretty(&config)?)?;
     let path = args.out.join("curve.csv");

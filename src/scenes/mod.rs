@@ -10,6 +10,7 @@ mod light;
 mod objects;
 mod patterns;
 mod rooms;
+pub mod sensor;
 #[cfg(feature = "benchmarks")]
 mod shapes;
 mod space;

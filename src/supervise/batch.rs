@@ -6,6 +6,7 @@ use crate::error::Result;
 use crate::model::{SdimModel, scatter};
 use crate::query::Query;
 use crate::query::prompt::Tokens;
+use crate::scenes::sensor::{CameraModel, DepthSensor};
 use crate::scenes::{RgbdFrame, SparsePattern, procedural};
 use crate::vlm::grid::Grid;
 use crate::vlm::preprocess::Pixels;
@@ -41,6 +42,9 @@ pub struct BatchConfig {
     pub labels: LabelSource,
     /// Frame sizes, one drawn per step; multiples of patch x merge.
     pub sizes: Vec<(usize, usize)>,
+    /// Share of the frames that pass through a random camera and depth sensor; labels stay clean.
+    #[serde(default)]
+    pub sensors: f32,
 }
 
 impl Default for BatchConfig {
@@ -52,6 +56,7 @@ impl Default for BatchConfig {
             points: (40, 1500),
             labels: LabelSource::Dense,
             sizes: vec![(256, 192), (256, 192), (224, 224), (272, 160), (320, 144), (192, 256)],
+            sensors: 0.6,
         }
     }
 }
@@ -116,7 +121,7 @@ fn example(model: &SdimModel, config: &BatchConfig, seed: u64, size: (usize, usi
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let mut frame = procedural(rng.random(), size.0, size.1)?;
     augment(&mut frame, &mut rng);
-    let measured = measure(&frame, config, &mut rng)?;
+    let measured = measure(&mut frame, config, &mut rng)?;
     let (prompted, held_back) = match config.labels {
         LabelSource::Dense => (measured, None),
         LabelSource::Sparse => split(&measured, &mut rng)?,
@@ -188,8 +193,9 @@ fn recolour(rgb: &mut RgbImage, order: [usize; 3], grey: bool) {
     }
 }
 
-/// Measurements of a frame: a pattern and a number of points drawn at random; some frames get sensor noise.
-fn measure(frame: &RgbdFrame, config: &BatchConfig, rng: &mut ChaCha8Rng) -> Result<SparseDepth> {
+/// Measurements of a frame: a pattern and a number of points drawn at random. A share of the frames is seen by a random
+/// camera and measured by a random depth sensor; the frame's depth, of which labels are made, stays clean.
+fn measure(frame: &mut RgbdFrame, config: &BatchConfig, rng: &mut ChaCha8Rng) -> Result<SparseDepth> {
     let (width, height) = (frame.rgb.width() as usize, frame.rgb.height() as usize);
     let (low, high) = config.points;
     let points = (low as f32 * (high as f32 / low as f32).powf(rng.random::<f32>())) as usize;
@@ -198,16 +204,12 @@ fn measure(frame: &RgbdFrame, config: &BatchConfig, rng: &mut ChaCha8Rng) -> Res
         1 | 2 => SparsePattern::Lidar { lines: rng.random_range(4..24) },
         _ => SparsePattern::Uniform,
     };
-    let exact = pattern.sample(&frame.rgb, &frame.depth, width, height, points, rng)?;
-    if rng.random_bool(0.75) {
-        return Ok(exact);
+    if rng.random::<f32>() >= config.sensors {
+        return pattern.sample(&frame.rgb, &frame.depth, width, height, points, rng);
     }
-    let noise = 0.02 * rng.random::<f32>();
-    let noisy: Vec<_> = exact
-        .points()
-        .map(|(x, y, d)| (x, y, d * (1.0 + noise * (rng.random::<f32>() + rng.random::<f32>() - 1.0))))
-        .collect();
-    SparseDepth::from_points(width, height, &noisy)
+    let measured = DepthSensor::draw(rng).measure(&frame.rgb, &frame.depth, rng)?;
+    frame.rgb = CameraModel::draw(rng).photograph(&frame.rgb, rng)?;
+    pattern.sample(&frame.rgb, &measured, width, height, points, rng)
 }
 
 /// Holds 30 % of the measurements back as labels.

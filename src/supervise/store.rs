@@ -4,6 +4,7 @@ use super::init::FreshFiles;
 use super::optimiser::Parameters;
 use crate::error::{Error, Result};
 use crate::files::{write_tensors, write_whole};
+use crate::vlm::weights::Weights;
 use candle_core::{DType, Device, Tensor};
 use std::collections::HashMap;
 use std::path::Path;
@@ -45,6 +46,24 @@ pub fn save_state(dir: &Path, parameters: &Parameters, step: usize) -> Result<()
     }
     tensors.insert("step".into(), Tensor::new(&[step as u32], &Device::Cpu)?);
     write_tensors(&dir.join("trainer.safetensors"), &tensors)
+}
+
+/// Reads the weights of a published checkpoint (`model.safetensors`) as values and averages; moments stay as they are.
+///
+/// # Errors
+/// [`Error::Io`], [`Error::Format`] on a damaged file, [`Error::Tensor`] or [`Error::TensorSet`] if it belongs to another
+/// model.
+pub fn load_weights(dir: &Path, parameters: &mut Parameters) -> Result<()> {
+    let weights = Weights::from_dir(dir, &Device::Cpu)?;
+    let mut all = Vec::with_capacity(parameters.all.len());
+    for (name, p) in &parameters.all {
+        all.push(weights.get(name, p.var.dims())?.flatten_all()?.to_vec1::<f32>()?);
+    }
+    weights.finish()?;
+    for (p, values) in parameters.all.values_mut().zip(all) {
+        p.set(&values, &values)?;
+    }
+    Ok(())
 }
 
 /// Reads what [`save_state`] wrote and returns the number of finished steps.

@@ -117,6 +117,17 @@ impl Trainer {
         Ok(Self { config, files, parameters, model, step: 0, prefetched: None })
     }
 
+    /// Starts from the weights of a checkpoint of the same shape, with fresh moments at step 0, as after [`Trainer::new`].
+    ///
+    /// # Errors
+    /// [`Error::Io`], [`Error::Format`] on a damaged file; [`Error::Tensor`] or [`Error::TensorSet`] if it belongs to another
+    /// model.
+    pub fn start_from(&mut self, dir: &Path) -> Result<()> {
+        store::load_weights(dir, &mut self.parameters)?;
+        (self.step, self.prefetched) = (0, None);
+        Ok(())
+    }
+
     /// Continues from a state written by [`Trainer::save`].
     ///
     /// # Errors
