@@ -1,10 +1,12 @@
 //! Stages of one 640x480 frame on the embedded checkpoint: `cargo bench --bench frame`.
 
 use criterion::{Criterion, criterion_group, criterion_main};
+use sdim::depth::sample_points;
 use sdim::fusion::Normalise;
-use sdim::query::{Query, ask};
+use sdim::model::ask;
+use sdim::query::Query;
 use sdim::refine::{Answered, EdgeAwareFill, Fill, FillInput};
-use sdim::scenes::{procedural, sample_points};
+use sdim::scenes::procedural;
 use sdim::{CompleteOptions, DepthCompleter, QueryPlan};
 
 fn frame(c: &mut Criterion) {

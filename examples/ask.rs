@@ -10,7 +10,7 @@ use clap::Parser;
 use sdim::kernels::WeightFormat;
 use sdim::read_rgb;
 use sdim::system::device;
-use sdim::vlm::{AnswerOptions, ChatModel};
+use sdim::vlm::chat::{AnswerOptions, ChatModel};
 use serde_json::json;
 use std::path::PathBuf;
 use std::process::ExitCode;

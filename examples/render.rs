@@ -5,8 +5,9 @@
 use clap::Parser;
 use sdim::DepthScale;
 use sdim::benchmarks::{DepthFile, write_frame};
-use sdim::depth::png16;
-use sdim::scenes::{procedural, sample_points};
+use sdim::depth::io::png16;
+use sdim::depth::sample_points;
+use sdim::scenes::procedural;
 use std::path::PathBuf;
 
 #[derive(Parser)]

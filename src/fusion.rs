@@ -11,7 +11,7 @@
 
 use crate::error::Result;
 use crate::kernels;
-use crate::vlm::weights::Weights;
+use crate::vlm::checkpoint::weights::Weights;
 use candle_core::Tensor;
 
 /// Epsilon of the batch normalisation.

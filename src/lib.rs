@@ -7,18 +7,20 @@
 #![deny(unsafe_op_in_unsafe_fn)]
 #![warn(clippy::all)]
 
-pub mod adapter;
 #[cfg(feature = "benchmarks")]
 pub mod benchmarks;
+pub mod classical;
 pub mod complete;
 pub mod depth;
+pub mod draw;
 pub mod error;
 mod files;
-pub mod frame;
 pub mod fusion;
 #[cfg(feature = "hub")]
 pub mod hub;
+pub mod image;
 pub mod kernels;
+pub mod metrics;
 pub mod model;
 pub mod query;
 pub mod refine;
@@ -29,10 +31,10 @@ pub mod supervise;
 pub mod system;
 pub mod vlm;
 
+pub use self::image::read_rgb;
 pub use complete::{CancelToken, CompleteOptions, Completion, DepthCompleter, Preserve};
 pub use depth::{DepthMap, DepthScale, SparseDepth};
 pub use error::{Error, Result};
-pub use frame::read_rgb;
 pub use kernels::WeightFormat;
 pub use model::{LoadOptions, SdimModel};
 pub use query::{AnswerMode, QueryPlan};

@@ -4,12 +4,12 @@ mod common;
 
 use candle_core::{Device, Tensor};
 use common::tiny;
-use sdim::adapter::Adapter;
 use sdim::fusion::FusionConfig;
+use sdim::model::Adapter;
 use sdim::model::{LoadOptions, SdimModel};
 use sdim::query::{PixelReference, Settings};
 use sdim::supervise::init::FreshFiles;
-use sdim::vlm::lora::{LoraConfig, LoraMode};
+use sdim::vlm::checkpoint::lora::{LoraConfig, LoraMode};
 use sdim::{CompleteOptions, DepthCompleter, Error, QueryPlan, WeightFormat};
 use std::path::Path;
 

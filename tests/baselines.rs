@@ -4,9 +4,10 @@ use image::{Rgb, RgbImage};
 use proptest::collection::vec;
 use proptest::prelude::*;
 use safetensors::SafeTensors;
-use sdim::depth::baselines::Baseline;
-use sdim::depth::metrics::errors;
-use sdim::scenes::{procedural, sample_points};
+use sdim::classical::Baseline;
+use sdim::depth::sample_points;
+use sdim::metrics::errors;
+use sdim::scenes::procedural;
 use sdim::{Error, SparseDepth};
 
 /// A tensor of the fixture: (width, height, values).

@@ -1,7 +1,8 @@
 //! The promises of `DepthCompleter::complete`, on the embedded checkpoint.
 
 use image::RgbImage;
-use sdim::scenes::{procedural, sample_points};
+use sdim::depth::sample_points;
+use sdim::scenes::procedural;
 use sdim::{
     CompleteOptions, DepthCompleter, DepthMap, DepthScale, Error, Preserve, QueryPlan, SparseDepth, read_rgb,
 };
@@ -70,7 +71,7 @@ fn beats_linear_interpolation_on_held_out_scenes() {
         let frame = procedural(seed, 320, 240).unwrap();
         let sparse = sample_points(&frame.depth, 320, 240, 100, seed).unwrap();
         let map = TINY.complete(&frame.rgb, &sparse, &options(QueryPlan::Stride(4))).unwrap();
-        let mae = |d: &[f32]| sdim::depth::metrics::errors(d, &frame.depth, &sparse).unwrap().mae;
+        let mae = |d: &[f32]| sdim::metrics::errors(d, &frame.depth, &sparse).unwrap().mae;
         model += mae(map.depth());
         linear += mae(&sdim::depth::interpolate::linear(&sparse).unwrap());
     }

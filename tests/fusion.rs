@@ -7,9 +7,9 @@ use common::relative_difference;
 use common::tiny::{self, Tensors};
 use sdim::SparseDepth;
 use sdim::fusion::{BatchStats, Fusion, FusionConfig, Normalise};
-use sdim::model::SdimModel;
-use sdim::query::{Query, Settings, ask};
-use sdim::vlm::weights::Weights;
+use sdim::model::{SdimModel, ask};
+use sdim::query::{Query, Settings};
+use sdim::vlm::checkpoint::weights::Weights;
 
 const CONFIG: FusionConfig = FusionConfig { branch: 6, high: 10, low: 5 };
 

@@ -3,7 +3,7 @@
 use proptest::collection::vec;
 use proptest::prelude::*;
 use sdim::SparseDepth;
-use sdim::depth::metrics::*;
+use sdim::metrics::*;
 
 /// Prediction and truth of a 12x8 frame, some pixels without one or the other.
 fn frame() -> impl Strategy<Value = Vec<(f32, f32)>> {

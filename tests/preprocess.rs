@@ -6,8 +6,8 @@ mod common;
 
 use common::random::mix;
 use image::RgbImage;
-use sdim::vlm::preprocess::PreprocessorConfig;
-use sdim::vlm::resize::bicubic;
+use sdim::image::resize::bicubic;
+use sdim::vlm::qwen2_5::preprocess::PreprocessorConfig;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 

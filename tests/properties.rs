@@ -5,7 +5,7 @@ use proptest::prelude::*;
 use sdim::query::number::{DigitReader, read_bins};
 use sdim::query::plan::{lattice, stride_within};
 use sdim::query::prompt::choose_evenly;
-use sdim::vlm::preprocess::PreprocessorConfig;
+use sdim::vlm::qwen2_5::preprocess::PreprocessorConfig;
 use sdim::{DepthScale, Error, SparseDepth};
 
 proptest! {

@@ -7,16 +7,16 @@ use common::{close, relative_difference, tiny};
 use image::RgbImage;
 use sdim::SparseDepth;
 use sdim::kernels::Block;
-use sdim::model::SdimModel;
+use sdim::model::{Prefix, SdimModel, ask};
 use sdim::query::number::{DepthUnit, DigitReader, NumberFormat, Reading, read_bins};
 use sdim::query::prompt::Tokens;
-use sdim::query::{Hint, MeasurementPrompt, PixelReference, Prefix, Query, Settings, ask};
+use sdim::query::{Hint, MeasurementPrompt, PixelReference, Query, Settings};
 use sdim::supervise::init::FreshFiles;
-use sdim::vlm::cache::KvCache;
-use sdim::vlm::decoder::{Context, Keep};
-use sdim::vlm::grid::Grid;
-use sdim::vlm::rope::{Position, RopeLayout};
-use sdim::vlm::sequences::Sequences;
+use sdim::vlm::qwen2_5::cache::KvCache;
+use sdim::vlm::qwen2_5::decoder::{Context, Keep};
+use sdim::vlm::qwen2_5::grid::Grid;
+use sdim::vlm::qwen2_5::rope::{Position, RopeLayout};
+use sdim::vlm::qwen2_5::sequences::Sequences;
 
 /// Largest difference, relative to the largest value.
 const TOLERANCE: f64 = 1e-4;

@@ -5,10 +5,10 @@
 
 mod common;
 
-use sdim::vlm::chat::{ChatPrompt, Message, Part, Role, expand_image_placeholders};
-use sdim::vlm::config::{SpecialIds, VlmConfig};
-use sdim::vlm::preprocess::PreprocessorConfig;
-use sdim::vlm::tokenizer::Tokenizer;
+use sdim::vlm::chat::template::{ChatPrompt, Message, Part, Role, expand_image_placeholders};
+use sdim::vlm::chat::tokenizer::Tokenizer;
+use sdim::vlm::qwen2_5::config::{SpecialIds, VlmConfig};
+use sdim::vlm::qwen2_5::preprocess::PreprocessorConfig;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 
@@ -135,7 +135,7 @@ fn the_published_template_is_the_one_written_out() {
         template.trim_end(),
         std::fs::read_to_string(dir.join("chat_template.jinja")).unwrap().trim_end()
     );
-    assert!(template.contains(sdim::vlm::chat::DEFAULT_SYSTEM));
+    assert!(template.contains(sdim::vlm::chat::template::DEFAULT_SYSTEM));
 }
 
 #[test]

@@ -3,7 +3,7 @@
 use anyhow::Context;
 use sdim::SparseDepth;
 use sdim::benchmarks::Sample;
-use sdim::depth::figure::Comparison;
+use sdim::draw::figure::Comparison;
 use std::path::Path;
 
 /// Writes one frame's figure, making its folder.

@@ -44,7 +44,7 @@ mod speed;
 use anyhow::{Context, bail, ensure};
 use clap::Parser;
 use sdim::benchmarks::Layout;
-use sdim::scenes::SparsePattern;
+use sdim::depth::SparsePattern;
 use sdim::{DepthScale, LoadOptions, QueryPlan, WeightFormat};
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;

@@ -4,7 +4,7 @@ use crate::common::load_as;
 use crate::{Args, settings};
 use anyhow::{Context, bail, ensure};
 use image::RgbImage;
-use sdim::depth::baselines::Baseline;
+use sdim::classical::Baseline;
 use sdim::{CompleteOptions, DepthCompleter, DepthMap, SparseDepth};
 use std::path::Path;
 

@@ -1,7 +1,7 @@
 //! One frame's scores, and the files that hold them.
 
 use anyhow::{Context, Result};
-use sdim::depth::metrics::{ConfidenceScores, Errors};
+use sdim::metrics::{ConfidenceScores, Errors};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;

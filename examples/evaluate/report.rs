@@ -5,7 +5,7 @@ use crate::record::{self, Named, Record, read_json, write_json, write_whole};
 use crate::settings::Settings;
 use crate::speed::Speed;
 use anyhow::{Context, ensure};
-use sdim::depth::metrics::{Interval, METRICS, bootstrap_mean, bootstrap_ratio};
+use sdim::metrics::{Interval, METRICS, bootstrap_mean, bootstrap_ratio};
 use serde::Serialize;
 use std::fmt::Write as _;
 use std::io::Write as _;

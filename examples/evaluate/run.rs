@@ -9,7 +9,7 @@ use anyhow::Context;
 use indicatif::{ProgressBar, ProgressStyle};
 use sdim::SparseDepth;
 use sdim::benchmarks::{Dataset, Sample, frame_seed};
-use sdim::depth::metrics::{
+use sdim::metrics::{
     DISTANCE_LIMITS, EdgeRule, Regions, errors, errors_everywhere, errors_in, gradient_error,
     score_confidence,
 };

@@ -1,7 +1,7 @@
 //! Floating-point operations of each stage: two per multiplication of a matrix product, nothing else counted.
 
-use sdim::vlm::config::VlmConfig;
-use sdim::vlm::grid::Grid;
+use sdim::vlm::qwen2_5::config::VlmConfig;
+use sdim::vlm::qwen2_5::grid::Grid;
 
 pub struct Cost<'a> {
     config: &'a VlmConfig,

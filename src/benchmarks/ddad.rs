@@ -5,9 +5,8 @@ use std::path::{Path, PathBuf};
 use super::files::{all_taken, depth, first_with, list, list_some, picture, some_valid, take, unpaired};
 use super::outliers::{THRESHOLD, WINDOW, remove_outliers};
 use super::{Dataset, Sample, entry, frame_seed};
-use crate::depth::{DepthScale, SparseDepth};
+use crate::depth::{DepthScale, SparseDepth, sample_points};
 use crate::error::Result;
-use crate::scenes::sample_points;
 
 #[derive(Clone, Debug)]
 struct Entry {

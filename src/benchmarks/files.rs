@@ -7,7 +7,7 @@ use image::RgbImage;
 
 use crate::depth::{DepthScale, SparseDepth};
 use crate::error::{Error, Result};
-use crate::frame::read_rgb;
+use crate::image::read_rgb;
 
 pub(super) const PICTURES: [&str; 3] = ["png", "jpg", "jpeg"];
 

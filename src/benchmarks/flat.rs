@@ -60,7 +60,7 @@ fn scales(path: &Path) -> Result<HashMap<String, DepthScale>> {
 mod tests {
     use super::super::{Dataset, FolderDataset};
     use super::*;
-    use crate::depth::png16;
+    use crate::depth::io::png16;
 
     fn write(dir: &Path, name: &str, value: u16) {
         image::RgbImage::new(8, 6).save(dir.join(format!("{name}_rgb.png"))).unwrap();

@@ -9,9 +9,10 @@ use image::ImageFormat;
 use super::files::{Listed, PICTURES, all_taken, depth, list, list_some, picture, take, unpaired};
 use super::flat::Flat;
 use super::{Dataset, Sample, entry};
-use crate::depth::{DepthScale, npy, png16};
+use crate::depth::DepthScale;
+use crate::depth::io::{npy, png16};
 use crate::error::{Error, Result};
-use crate::frame::image_error;
+use crate::image::image_error;
 use crate::scenes::RgbdFrame;
 
 const DEPTHS: [&str; 2] = ["png", "npy"];

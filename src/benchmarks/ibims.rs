@@ -7,7 +7,8 @@ use image::{Rgb, RgbImage};
 use super::files::{lines, list_some, naming, some_valid};
 use super::mat::Record;
 use super::{Dataset, Mask, Sample, entry};
-use crate::depth::{SparseDepth, pixel_count};
+use crate::depth::SparseDepth;
+use crate::depth::pixels::pixel_count;
 use crate::error::{Error, Result};
 
 /// Masks of the file that are passed on: the field, the name of the mask, and whether the pixels meant are those with 0.

@@ -30,9 +30,8 @@ use image::RgbImage;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use crate::depth::{DepthScale, SparseDepth};
+use crate::depth::{DepthScale, SparseDepth, SparsePattern};
 use crate::error::{Error, Result};
-use crate::scenes::SparsePattern;
 pub use ddad::DdadDataset;
 pub use folder::{DepthFile, FolderDataset, write_frame};
 pub use ibims::IbimsDataset;

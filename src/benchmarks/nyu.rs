@@ -158,7 +158,7 @@ fn halved(path: &Path) -> Result<(Vec<u8>, Vec<f32>)> {
         rgb.iter_mut().skip(c).step_by(3).zip(half).for_each(|(to, from)| *to = from);
     }
     let mut depth = file.floats("depth", None)?;
-    depth.iter_mut().filter(|d| !crate::depth::is_valid(**d)).for_each(|d| *d = f32::NAN);
+    depth.iter_mut().filter(|d| !crate::depth::pixels::is_valid(**d)).for_each(|d| *d = f32::NAN);
     let depth = half(&depth, |four: [f32; 4]| {
         let [a, b, c, d] = four.map(f64::from);
         (a * 0.125 + b * 0.375 + c * 0.375 + d * 0.125) as f32

@@ -8,7 +8,7 @@ use super::files::{
 use super::{Dataset, Sample, entry};
 use crate::depth::{DepthScale, SparseDepth};
 use crate::error::{Error, Result};
-use crate::vlm::resize::bicubic;
+use crate::image::resize::bicubic;
 
 #[derive(Clone, Debug)]
 struct Entry {

@@ -6,7 +6,8 @@ use image::RgbImage;
 
 use super::files::{below, depth, frame_name, lines, naming, picture, same_size, some_valid};
 use super::{Dataset, Sample, entry};
-use crate::depth::{DepthScale, SparseDepth, png16};
+use crate::depth::io::png16;
+use crate::depth::{DepthScale, SparseDepth};
 use crate::error::{Error, Result};
 
 #[derive(Clone, Debug)]

@@ -1,14 +1,14 @@
 //! The questions about one frame: which pixels are asked, the alignment of their answers to the measurements, and the dense
 //! map that comes of both.
 
-use super::{CancelToken, CompleteOptions, Preserve, Progress};
+use super::options::{CancelToken, CompleteOptions, Preserve, Progress};
 use crate::depth::interpolate::Interpolator;
 use crate::depth::{DepthMap, SparseDepth};
 use crate::error::Result;
-use crate::model::SdimModel;
+use crate::model::{Prefix, SdimModel, ask_within};
 use crate::query::plan::{Asked, lattice, refine_pixels, stride_within};
 use crate::query::prompt::choose_evenly;
-use crate::query::{Hint, Prefix, Query, QueryPlan, Reading, ask_within};
+use crate::query::{Hint, Query, QueryPlan, Reading};
 use crate::refine::{Answered, FillInput};
 use image::RgbImage;
 

@@ -4,7 +4,9 @@ use std::path::Path;
 
 use ndarray::ArrayView2;
 
-use super::{DepthScale, SparseDepth, check_length, is_valid, npy, pixel_count, png16, view2};
+use super::io::{npy, png16};
+use super::pixels::{check_length, is_valid, pixel_count, view2};
+use super::{DepthScale, SparseDepth};
 use crate::error::{Error, Result};
 
 /// Dense depth in metres (Z-depth) with a confidence, an expected error and a "measured" mark per pixel, all row-major.

@@ -55,7 +55,7 @@ impl DepthScale {
     ///
     /// Missing depth (NaN, 0, infinite, negative) gives 0. A valid depth never becomes 0, which would mean missing.
     pub fn stored(self, metres: f32) -> (u16, bool) {
-        if !super::is_valid(metres) {
+        if !crate::depth::pixels::is_valid(metres) {
             return (0, false);
         }
         // f64 holds the product exactly, so that a value read from a file is written back as the same integer.

@@ -4,7 +4,9 @@ use std::path::Path;
 
 use ndarray::ArrayView2;
 
-use super::{DepthScale, check_length, is_valid, npy, pixel_count, png16};
+use super::DepthScale;
+use super::io::{npy, png16};
+use super::pixels::{check_length, is_valid, pixel_count};
 use crate::error::{Error, Result};
 
 /// Measured depth at some pixels of a frame, in metres (Z-depth), NaN where nothing was measured.
@@ -113,7 +115,7 @@ impl SparseDepth {
 
     /// All pixels as (rows, columns), metres, NaN where not measured.
     pub fn view(&self) -> ArrayView2<'_, f32> {
-        super::view2(&self.depth, self.width, self.height)
+        crate::depth::pixels::view2(&self.depth, self.width, self.height)
     }
 
     /// The measurements as `(x, y, metres)`, row by row.

@@ -2,7 +2,7 @@
 
 use super::{Download, Files, Hub, Request, is_commit, newer};
 use crate::error::{Error, Result};
-use crate::vlm::shards::{INDEX, SINGLE, shard_names};
+use crate::vlm::checkpoint::shards::{INDEX, SINGLE, shard_names};
 use hf_hub::api::Progress;
 use hf_hub::api::sync::{Api, ApiBuilder, ApiRepo};
 use hf_hub::{Cache, Repo, RepoType};

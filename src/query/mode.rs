@@ -1,7 +1,7 @@
 //! Answer modes: forced words around a constrained number, or free speech that is read afterwards.
 
 use super::number::{DepthUnit, NumberFormat};
-use super::settings::Settings;
+use super::template::PromptTemplate;
 use crate::error::{Error, Result};
 
 /// How an answer is got.
@@ -42,7 +42,13 @@ impl AnswerMode {
     ///
     /// # Errors
     /// [`Error::Config`] names the field.
-    pub fn validate(&self, file: &str, settings: &Settings) -> Result<()> {
+    pub(crate) fn validate(
+        &self,
+        file: &str,
+        number: NumberFormat,
+        unit: DepthUnit,
+        template: &PromptTemplate,
+    ) -> Result<()> {
         let Self::Generate(g) = self else { return Ok(()) };
         let check = |ok: bool, key: &str, found: String, expected: &str| {
             if ok { Ok(()) } else { Err(Error::config(file, key, found, expected)) }
@@ -66,13 +72,13 @@ impl AnswerMode {
             "at least one token, or null",
         )?;
         check(
-            matches!(settings.number, NumberFormat::Digits { .. }),
+            matches!(number, NumberFormat::Digits { .. }),
             "answer_mode.kind",
             "\"generate\", but number.kind is \"bins\"".into(),
             "number.kind \"digits\", since only digits can be read from words",
         )?;
-        let named = settings.template.answer_unit();
-        let counted = match settings.unit {
+        let named = template.answer_unit();
+        let counted = match unit {
             DepthUnit::FrameMax => None,
             unit => Some(f64::from(unit.metres(1.0))),
         };
@@ -81,7 +87,7 @@ impl AnswerMode {
         check(
             agree,
             "unit",
-            format!("{:?}, but the answer is {:?}", settings.unit, settings.template.answer),
+            format!("{:?}, but the answer is {:?}", unit, template.answer),
             "the unit that the answer names",
         )
     }

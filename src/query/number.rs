@@ -2,7 +2,7 @@
 
 use crate::error::{Error, Result};
 use crate::kernels::bin_stats;
-use crate::vlm::tokenizer::Tokenizer;
+use crate::vlm::chat::tokenizer::Tokenizer;
 
 /// What the number 1 means in prompts and answers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
@@ -79,7 +79,7 @@ impl Reading {
 }
 
 /// Half-width of the interval whose probability is the confidence, relative to the answer.
-pub(super) const CONFIDENT_WITHIN: f32 = 0.05;
+pub(crate) const CONFIDENT_WITHIN: f32 = 0.05;
 
 impl NumberFormat {
     /// Checks the sizes of a configuration.

@@ -4,11 +4,11 @@ use super::number::{NumberFormat, Numbers};
 use super::settings::{MeasurementPrompt, PixelReference, Settings};
 use crate::depth::SparseDepth;
 use crate::error::{Error, Result};
-use crate::vlm::config::VlmConfig;
-use crate::vlm::grid::Grid;
-use crate::vlm::prompt::positions;
-use crate::vlm::rope::Position;
-use crate::vlm::tokenizer::Tokenizer;
+use crate::vlm::chat::tokenizer::Tokenizer;
+use crate::vlm::qwen2_5::config::VlmConfig;
+use crate::vlm::qwen2_5::grid::Grid;
+use crate::vlm::qwen2_5::positions::positions;
+use crate::vlm::qwen2_5::rope::Position;
 use rand::seq::SliceRandom;
 use rand_chacha::rand_core::SeedableRng;
 
@@ -274,7 +274,7 @@ impl PromptWriter {
     }
 
     /// The suffix of one query, with or without the forced words of the answer.
-    pub(super) fn tokens(
+    pub(crate) fn tokens(
         &self,
         query: &Query,
         space: &FrameSpace,

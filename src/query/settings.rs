@@ -7,8 +7,8 @@ use super::template::PromptTemplate;
 use crate::error::{Error, Result};
 use crate::files::read_text;
 use crate::fusion::FusionConfig;
-use crate::vlm::lora::{LoraConfig, LoraMode, LoraSet};
-use crate::vlm::rope::RopeLayout;
+use crate::vlm::checkpoint::lora::{LoraConfig, LoraMode, LoraSet};
+use crate::vlm::qwen2_5::rope::RopeLayout;
 use serde_json::Value;
 
 /// The format version that this crate writes and reads.
@@ -266,7 +266,12 @@ impl Settings {
         self.template.validate(file)?;
         self.number.validate(file)?;
         self.validate_reference(file)?;
-        self.answer_mode.validate(file, self)
+        self.validate_mode(file, &self.answer_mode)
+    }
+
+    /// Whether an answer mode is right by itself and goes with these settings; `file` is for messages.
+    pub(crate) fn validate_mode(&self, file: &str, mode: &AnswerMode) -> Result<()> {
+        mode.validate(file, self.number, self.unit, &self.template)
     }
 
     fn validate_reference(&self, file: &str) -> Result<()> {

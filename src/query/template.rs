@@ -1,6 +1,6 @@
 //! The words of the prompt and of the answer.
 
-use super::answer::split_unit;
+use super::unit::split_unit;
 use crate::error::{Error, Result};
 
 /// The paper's question Q (Sec. 3.3).
@@ -150,7 +150,7 @@ impl PromptTemplate {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::vlm::chat::{ChatPrompt, IMAGE_PLACEHOLDER, Part};
+    use crate::vlm::chat::template::{ChatPrompt, IMAGE_PLACEHOLDER, Part};
 
     #[test]
     fn the_papers_sentences_are_verbatim() {

@@ -3,10 +3,31 @@
 use image::RgbImage;
 use rayon::prelude::*;
 
-use super::{EdgeAwareFill, FillInput, Filled};
+use super::fill::{FillInput, Filled};
 use crate::depth::interpolate::Plane;
-use crate::depth::mesh::{Mesh, NONE, Owner};
+use crate::depth::interpolate::mesh::{Mesh, NONE, Owner};
 use crate::error::Result;
+
+/// Linear within surfaces, and at a depth edge each pixel goes to the side whose colour and place it fits, never between.
+///
+/// Answers are joined to a Delaunay mesh, so any set works, a lattice or a set that is denser at edges. Inside a triangle
+/// whose corners and their neighbours lie on one surface the *inverse* depth is interpolated linearly, which is exact for a plane
+/// under a pinhole camera. Other triangles hold an edge: their corners and the corners behind their edges are
+/// sorted into surfaces by depth, each surface is weighted by nearness in colour and place, and the pixel takes the mean
+/// of the heaviest one. Doubt between the surfaces lowers the confidence and raises the expected error.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct EdgeAwareFill {
+    /// Relative difference of depth between neighbouring answers from which they may belong to different surfaces.
+    pub edge_ratio: f32,
+    /// Difference of colour (Euclidean, 8-bit RGB) that counts as one standard deviation.
+    pub colour_sigma: f32,
+}
+
+impl Default for EdgeAwareFill {
+    fn default() -> Self {
+        Self { edge_ratio: 0.08, colour_sigma: 20.0 }
+    }
+}
 
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Value {

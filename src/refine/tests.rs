@@ -1,5 +1,6 @@
 use super::*;
-use image::Rgb;
+use crate::depth::SparseDepth;
+use image::{Rgb, RgbImage};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 

@@ -3,11 +3,12 @@
 use image::RgbImage;
 use rand::Rng;
 
-use super::camera::{Camera, Intrinsics};
+use super::camera::Camera;
 use super::cast::{Hits, NOTHING, cast};
 use super::space::{V3, add, dot, mix, mul, norm, sub, times, unit};
 use super::stage::Stage;
-use super::texture::hash;
+use crate::depth::Intrinsics;
+use crate::depth::sampling::noise::hash;
 
 const SHADOW_SIZE: usize = 192;
 

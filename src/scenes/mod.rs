@@ -1,4 +1,4 @@
-//! Procedural RGB-D scenes for training, and sparse patterns.
+//! Procedural RGB-D scenes for training.
 //!
 //! [`procedural`] casts rays into random indoor and outdoor scenes: its depth is exact, its colours are as unlike each
 //! other as a real camera's. [`SparsePattern`] takes the measurements that a sensor would have made.
@@ -8,7 +8,6 @@ mod cast;
 mod furniture;
 mod light;
 mod objects;
-mod patterns;
 mod rooms;
 pub mod sensor;
 #[cfg(feature = "benchmarks")]
@@ -23,9 +22,8 @@ use image::RgbImage;
 use rand::{RngCore, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
+use crate::depth::Intrinsics;
 use crate::error::{Error, Result};
-pub use camera::Intrinsics;
-pub use patterns::{SparsePattern, sample_points};
 use stage::Stage;
 
 /// An RGB image with the depth of every pixel.

@@ -2,11 +2,12 @@
 
 use std::f32::consts::{FRAC_PI_2, TAU};
 
-use super::camera::{Camera, Intrinsics};
+use super::camera::Camera;
 use super::furniture::Top;
 use super::space::{V3, mul};
 use super::stage::{Place, Stage};
 use super::texture::Pattern;
+use crate::depth::Intrinsics;
 
 /// Inner size of a room: half width, height, half length. Its floor's centre is the origin.
 type Size = [f32; 3];

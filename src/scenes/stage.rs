@@ -7,6 +7,7 @@ use super::camera::Camera;
 use super::shapes::{Kind, Solid};
 use super::space::{Rot, UPRIGHT, V3, add, compose, dot, mix, mul, norm, sub, to_world, turned, unit};
 use super::texture::{Material, Pattern};
+use crate::depth::sampling::choice::Below;
 
 /// A light at a point; a sun is a light very far away without fall-off.
 #[derive(Clone, Debug)]
@@ -271,16 +272,5 @@ impl Stage {
         let warm = self.real(-0.1, 0.35);
         let colour = mul([1.0, 1.0 - 0.4 * warm, 1.0 - warm], strength);
         self.lights.push(Light { at, colour, reach });
-    }
-}
-
-/// Bounded integers from the generator's raw words, so that their values do not depend on the version of `rand`.
-pub(super) trait Below {
-    fn next_u32_below(&mut self, n: usize) -> usize;
-}
-
-impl<R: Rng + ?Sized> Below for R {
-    fn next_u32_below(&mut self, n: usize) -> usize {
-        ((u64::from(self.next_u32()) * n as u64) >> 32) as usize
     }
 }

@@ -2,10 +2,10 @@
 
 use std::f32::consts::{FRAC_PI_2, PI, TAU};
 
-use super::camera::Intrinsics;
 use super::space::{V3, mix, mul, unit};
 use super::stage::{Paint, Place, Stage};
 use super::texture::Pattern;
+use crate::depth::Intrinsics;
 
 impl Stage {
     fn daylight(&mut self) {

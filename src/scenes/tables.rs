@@ -2,9 +2,9 @@
 
 use std::f32::consts::TAU;
 
-use super::camera::Intrinsics;
 use super::furniture::Top;
 use super::stage::{Place, Stage};
+use crate::depth::Intrinsics;
 
 impl Stage {
     /// A work place seen from standing or sitting height.

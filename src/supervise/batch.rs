@@ -1,15 +1,15 @@
 //! From a seed to a training batch: frames, measurements, questions and their true answers.
 
-use crate::depth::SparseDepth;
 use crate::depth::interpolate::Interpolator;
+use crate::depth::{SparseDepth, SparsePattern};
 use crate::error::Result;
 use crate::model::{SdimModel, scatter};
 use crate::query::Query;
 use crate::query::prompt::Tokens;
 use crate::scenes::sensor::{CameraModel, DepthSensor};
-use crate::scenes::{RgbdFrame, SparsePattern, procedural};
-use crate::vlm::grid::Grid;
-use crate::vlm::preprocess::Pixels;
+use crate::scenes::{RgbdFrame, procedural};
+use crate::vlm::qwen2_5::grid::Grid;
+use crate::vlm::qwen2_5::preprocess::Pixels;
 use image::RgbImage;
 use rand::Rng;
 use rand::seq::SliceRandom;
@@ -151,7 +151,7 @@ fn example(model: &SdimModel, config: &BatchConfig, seed: u64, size: (usize, usi
         let mut p = tokens.next_text(&space);
         for &digit in &answer[..answer.len() - 1] {
             tokens.ids.push(writer.numbers().ids[digit]);
-            tokens.positions.push(crate::vlm::rope::Position::text(p));
+            tokens.positions.push(crate::vlm::qwen2_5::rope::Position::text(p));
             p += 1.0;
         }
         items.push(Item { tokens, supervised: answer.len(), answer, value, largest });

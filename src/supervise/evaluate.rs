@@ -1,11 +1,11 @@
 //! A quick look at a model while it trains: relative error on held-out procedural scenes against interpolation.
 
 use super::batch::mix;
-use crate::depth::interpolate;
+use crate::depth::{interpolate, sample_points};
 use crate::error::Result;
-use crate::model::SdimModel;
-use crate::query::{Query, ask};
-use crate::scenes::{procedural, sample_points};
+use crate::model::{SdimModel, ask};
+use crate::query::Query;
+use crate::scenes::procedural;
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;

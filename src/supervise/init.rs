@@ -158,7 +158,7 @@ fn normal(rng: &mut ChaCha8Rng) -> f32 {
     (-2.0 * u.ln()).sqrt() * (std::f32::consts::TAU * v).cos()
 }
 
-/// Initial values of all tensors of a layout (see [`crate::vlm::weights::Weights::wanted`]).
+/// Initial values of all tensors of a layout (see [`crate::vlm::checkpoint::weights::Weights::wanted`]).
 ///
 /// Norms are 1, biases 0, projections normal with variance 1 / inputs (those into the residual stream smaller), fusion
 /// convolutions He; the depth branch's and the last fusion convolution are 0 as the paper asks (Eq. 1b, 2b), and so is the

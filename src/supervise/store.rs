@@ -4,7 +4,7 @@ use super::init::FreshFiles;
 use super::optimiser::Parameters;
 use crate::error::{Error, Result};
 use crate::files::{write_tensors, write_whole};
-use crate::vlm::weights::Weights;
+use crate::vlm::checkpoint::weights::Weights;
 use candle_core::{DType, Device, Tensor};
 use std::collections::HashMap;
 use std::path::Path;

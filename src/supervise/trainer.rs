@@ -12,10 +12,10 @@ use crate::model::SdimModel;
 use crate::query::number::{NumberFormat, POINT};
 use crate::query::prompt::Glimpse;
 use crate::query::{PixelReference, Settings};
-use crate::vlm::decoder::Context;
-use crate::vlm::preprocess::Pixels;
-use crate::vlm::rope::Position;
-use crate::vlm::weights::Weights;
+use crate::vlm::checkpoint::weights::Weights;
+use crate::vlm::qwen2_5::decoder::Context;
+use crate::vlm::qwen2_5::preprocess::Pixels;
+use crate::vlm::qwen2_5::rope::Position;
 use candle_core::{Device, Tensor};
 use std::path::Path;
 

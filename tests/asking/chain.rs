@@ -1,15 +1,13 @@
 //! Forced and free answers on a model that says what it is told to say, and what is refused.
 
-use crate::common::tiny;
-use crate::common::{beside, close};
+use crate::common::{beside, close, tiny};
 use crate::setup::{DISC, Setup, by_coordinates, by_marker};
 use candle_core::{Device, Tensor};
-use sdim::model::SdimModel;
+use sdim::model::{SdimModel, ask, ask_as, generate};
 use sdim::query::{
-    AnswerMode, Generation, Marker, MeasurementPrompt, PixelReference, PromptTemplate, Query, Settings, ask,
-    ask_as, generate,
+    AnswerMode, Generation, Marker, MeasurementPrompt, PixelReference, PromptTemplate, Query, Settings,
 };
-use sdim::vlm::tokenizer::Tokenizer;
+use sdim::vlm::chat::tokenizer::Tokenizer;
 use sdim::{CompleteOptions, DepthCompleter, Error, QueryPlan};
 
 /// A model whose next token hangs on the last one alone: after an unmeasured pixel it says `d=4.25m`, where the 4 might

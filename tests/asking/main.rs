@@ -7,11 +7,11 @@ mod common;
 mod setup;
 
 use candle_core::Tensor;
-use common::close;
-use common::{relative_difference, tiny};
-use sdim::query::{Generation, Marker, PixelReference, PromptTemplate, Query, Settings, Spoken};
-use sdim::vlm::decoder::Keep;
-use sdim::vlm::rope::Position;
+use common::{close, relative_difference, tiny};
+use sdim::model::Spoken;
+use sdim::query::{Generation, Marker, PixelReference, PromptTemplate, Query, Settings};
+use sdim::vlm::qwen2_5::decoder::Keep;
+use sdim::vlm::qwen2_5::rope::Position;
 use setup::{DISC, Setup, by_coordinates, by_marker};
 
 #[test]

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use sdim::Error;
 use sdim::benchmarks::Layout;
-use sdim::scenes::SparsePattern;
+use sdim::depth::SparsePattern;
 use serde_json::Value;
 
 use crate::{all, open, says};

@@ -3,8 +3,8 @@
 use std::fs;
 
 use sdim::benchmarks::{Layout, LayoutOptions, frame_seed};
-use sdim::depth::npy;
-use sdim::scenes::SparsePattern;
+use sdim::depth::SparsePattern;
+use sdim::depth::io::npy;
 use sdim::{DepthScale, Error};
 
 use crate::copies::{H, W, kitti, picture};

@@ -13,7 +13,7 @@ use std::path::Path;
 
 use copies::{H, W, depth, grey8};
 use sdim::benchmarks::{Dataset, Layout, LayoutOptions, Sample};
-use sdim::depth::png16;
+use sdim::depth::io::png16;
 use sdim::{Error, Result};
 
 fn open(layout: Layout, dir: &Path) -> Result<Box<dyn Dataset>> {

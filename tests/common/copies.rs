@@ -5,7 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use image::{Rgb, RgbImage};
-use sdim::depth::png16;
+use sdim::depth::io::png16;
 
 /// Size of a frame.
 pub const W: usize = 24;

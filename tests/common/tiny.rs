@@ -7,7 +7,7 @@ use sdim::model::SdimModel;
 use sdim::query::Settings;
 use sdim::query::number::Numbers;
 use sdim::supervise::init::{FreshFiles, initial};
-use sdim::vlm::weights::Weights;
+use sdim::vlm::checkpoint::weights::Weights;
 use std::collections::HashMap;
 use std::path::Path;
 

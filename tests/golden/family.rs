@@ -7,12 +7,12 @@ use super::stages::Case;
 use super::{CPU, json};
 use candle_core::{DType, Tensor};
 use sdim::kernels::WeightFormat;
-use sdim::vlm::QwenVl;
-use sdim::vlm::config::VlmConfig;
-use sdim::vlm::grid::Grid;
-use sdim::vlm::preprocess::PreprocessorConfig;
-use sdim::vlm::rope::RopeLayout;
-use sdim::vlm::weights::Weights;
+use sdim::vlm::checkpoint::weights::Weights;
+use sdim::vlm::qwen2_5::QwenVl;
+use sdim::vlm::qwen2_5::config::VlmConfig;
+use sdim::vlm::qwen2_5::grid::Grid;
+use sdim::vlm::qwen2_5::preprocess::PreprocessorConfig;
+use sdim::vlm::qwen2_5::rope::RopeLayout;
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 

@@ -5,14 +5,14 @@ use super::family::{Family, NAMES};
 use super::{CPU, json, own_fixture};
 use candle_core::{DType, Tensor};
 use sdim::kernels::WeightFormat::{self, Bf16, F32, Int8};
-use sdim::vlm::QwenVl;
-use sdim::vlm::config::VlmConfig;
-use sdim::vlm::decoder::Keep;
-use sdim::vlm::grid::Grid;
-use sdim::vlm::preprocess::PreprocessorConfig;
-use sdim::vlm::prompt::positions;
-use sdim::vlm::rope::RopeLayout;
-use sdim::vlm::weights::Weights;
+use sdim::vlm::checkpoint::weights::Weights;
+use sdim::vlm::qwen2_5::QwenVl;
+use sdim::vlm::qwen2_5::config::VlmConfig;
+use sdim::vlm::qwen2_5::decoder::Keep;
+use sdim::vlm::qwen2_5::grid::Grid;
+use sdim::vlm::qwen2_5::positions::positions;
+use sdim::vlm::qwen2_5::preprocess::PreprocessorConfig;
+use sdim::vlm::qwen2_5::rope::RopeLayout;
 use std::collections::HashMap;
 
 /// One prompt, with the rows of its images.

@@ -11,12 +11,12 @@ mod stages;
 
 use candle_core::{DType, Device, Tensor};
 use common::Golden;
-use sdim::vlm::QwenVl;
-use sdim::vlm::config::VlmConfig;
-use sdim::vlm::grid::Grid;
-use sdim::vlm::preprocess::{Pixels, PreprocessorConfig};
-use sdim::vlm::rope::RopeLayout;
-use sdim::vlm::weights::Weights;
+use sdim::vlm::checkpoint::weights::Weights;
+use sdim::vlm::qwen2_5::QwenVl;
+use sdim::vlm::qwen2_5::config::VlmConfig;
+use sdim::vlm::qwen2_5::grid::Grid;
+use sdim::vlm::qwen2_5::preprocess::{Pixels, PreprocessorConfig};
+use sdim::vlm::qwen2_5::rope::RopeLayout;
 use stages::Case;
 use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};

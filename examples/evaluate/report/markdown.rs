@@ -3,7 +3,7 @@
 use crate::Score;
 
 use super::{MethodTable, Table, Tables};
-use sdim::depth::metrics::{Interval, METRICS, Metric};
+use sdim::metrics::{Interval, METRICS, Metric};
 use std::fmt::Write;
 
 /// Metrics with intervals in the first table; the others follow without.

@@ -1,0 +1,174 @@
+//! The one function that users call: an RGB frame and sparse depth in, dense depth out.
+
+mod options;
+mod questions;
+
+pub use options::{CancelToken, CompleteOptions, Preserve, Progress, ProgressCallback};
+
+use crate::depth::{DepthMap, SparseDepth};
+use crate::error::{Error, Result};
+use crate::model::{LoadOptions, SdimModel};
+use crate::vlm::qwen2_5::preprocess::MAX_RATIO;
+use candle_core::Device;
+use image::RgbImage;
+use questions::Questions;
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Instant;
+
+/// Seconds spent in each stage.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct StageSeconds {
+    /// Preprocessing, fusion and vision encoder.
+    pub encode: f64,
+    /// Reading the shared prefix.
+    pub prefill: f64,
+    /// Asking.
+    pub queries: f64,
+    /// Alignment and filling.
+    pub refine: f64,
+    /// All of it.
+    pub total: f64,
+}
+
+/// A dense map with what it took.
+#[derive(Debug, Clone)]
+pub struct Completion {
+    /// The result.
+    pub map: DepthMap,
+    /// Pixels asked, those for alignment included.
+    pub asked: usize,
+    /// Time per stage.
+    pub seconds: StageSeconds,
+}
+
+/// Smallest side of a frame, pixels: one merged token of the published checkpoints.
+const MIN_SIDE: usize = 28;
+
+/// A loaded checkpoint, ready for frames. Cheap to clone and to share between threads.
+#[derive(Clone)]
+pub struct DepthCompleter {
+    model: Arc<SdimModel>,
+}
+
+impl DepthCompleter {
+    /// The small checkpoint that ships inside the crate (feature `tiny`), on the CPU.
+    ///
+    /// # Errors
+    /// None in practice: the embedded files are covered by tests.
+    #[cfg(feature = "tiny")]
+    pub fn tiny() -> Result<Self> {
+        Self::tiny_on(&Device::Cpu)
+    }
+
+    /// As [`DepthCompleter::tiny`], on another device.
+    ///
+    /// # Errors
+    /// [`Error::Tensors`] if the device refuses the tensors.
+    #[cfg(feature = "tiny")]
+    pub fn tiny_on(device: &Device) -> Result<Self> {
+        Self::tiny_with(&LoadOptions::on(device))
+    }
+
+    /// As [`DepthCompleter::tiny`], with a form of weights and an adapter.
+    ///
+    /// # Errors
+    /// [`Error::Tensors`] if the device refuses the tensors; what an adapter can have wrong.
+    #[cfg(feature = "tiny")]
+    pub fn tiny_with(options: &LoadOptions) -> Result<Self> {
+        Ok(Self::new(crate::model::tiny(options)?))
+    }
+
+    /// Loads a checkpoint directory onto a device.
+    ///
+    /// # Errors
+    /// As [`SdimModel::load`].
+    pub fn load(dir: impl AsRef<Path>, device: &Device) -> Result<Self> {
+        Ok(Self::new(SdimModel::load(dir.as_ref(), device)?))
+    }
+
+    /// Loads a checkpoint directory with a form of weights and an adapter.
+    ///
+    /// # Errors
+    /// As [`SdimModel::load_with`].
+    pub fn load_with(dir: impl AsRef<Path>, options: &LoadOptions) -> Result<Self> {
+        Ok(Self::new(SdimModel::load_with(dir.as_ref(), options)?))
+    }
+
+    /// Wraps a model.
+    pub fn new(model: SdimModel) -> Self {
+        Self { model: Arc::new(model) }
+    }
+
+    /// The model.
+    pub fn model(&self) -> &SdimModel {
+        &self.model
+    }
+
+    /// Completes a frame: Z-depth in metres for each pixel, with a confidence.
+    ///
+    /// # Errors
+    /// [`Error::SizeMismatch`]; [`Error::ImageSize`] on a side under 28 pixels or an aspect ratio over 200;
+    /// [`Error::NoMeasurement`]; [`Error::Config`] if the answer mode does not go with the checkpoint or the frame is too small
+    /// for its mark; [`Error::Cancelled`].
+    pub fn complete(
+        &self,
+        rgb: &RgbImage,
+        sparse: &SparseDepth,
+        options: &CompleteOptions,
+    ) -> Result<DepthMap> {
+        Ok(self.complete_detailed(rgb, sparse, options)?.map)
+    }
+
+    /// As [`DepthCompleter::complete`], with counts and times.
+    ///
+    /// # Errors
+    /// As [`DepthCompleter::complete`].
+    pub fn complete_detailed(
+        &self,
+        rgb: &RgbImage,
+        sparse: &SparseDepth,
+        options: &CompleteOptions,
+    ) -> Result<Completion> {
+        let start = Instant::now();
+        let size = (rgb.width() as usize, rgb.height() as usize);
+        if size != (sparse.width(), sparse.height()) {
+            return Err(Error::SizeMismatch { rgb: size, depth: (sparse.width(), sparse.height()) });
+        }
+        if size.0.min(size.1) < MIN_SIDE || size.0.max(size.1) > MAX_RATIO * size.0.min(size.1) {
+            let reason = format!(
+                "expected sides of at least {MIN_SIDE} pixels and an aspect ratio of at most {MAX_RATIO}"
+            );
+            return Err(Error::ImageSize { width: size.0, height: size.1, reason });
+        }
+        sparse.require_points()?;
+        if let Some(mode) = &options.answer {
+            self.model.prompts.settings().validate_mode("CompleteOptions", mode)?;
+        }
+        let mut seconds = StageSeconds::default();
+        let _span = tracing::info_span!("complete", width = size.0, height = size.1).entered();
+        let span = tracing::info_span!("encode").entered();
+        let (pixels, scattered) = self.model.preprocess(rgb, sparse)?;
+        let encoded = self.model.encode_frame(rgb, &pixels, &scattered)?;
+        drop(span);
+        seconds.encode = start.elapsed().as_secs_f64();
+        let span = tracing::info_span!("prefill").entered();
+        let mark = Instant::now();
+        let prefix = self.model.read_encoded(&pixels, encoded, sparse)?;
+        drop(span);
+        seconds.prefill = mark.elapsed().as_secs_f64();
+        let span = tracing::info_span!("queries").entered();
+        let mark = Instant::now();
+        let questions = Questions::new(&self.model, &prefix, sparse, options)?;
+        let (answers, residual) = questions.ask_all()?;
+        drop(span);
+        seconds.queries = mark.elapsed().as_secs_f64();
+        let _refine = tracing::info_span!("refine").entered();
+        let mark = Instant::now();
+        let asked = answers.len() + residual.points.len();
+        let map = questions.dense(rgb, answers, &residual)?;
+        seconds.refine = mark.elapsed().as_secs_f64();
+        seconds.total = start.elapsed().as_secs_f64();
+        Ok(Completion { map, asked, seconds })
+    }
+}

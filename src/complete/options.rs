@@ -1,0 +1,95 @@
+//! How a frame is completed.
+
+use crate::query::{AnswerMode, QueryPlan};
+use crate::refine::{EdgeAwareFill, Fill};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+/// What becomes of measured pixels.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Preserve {
+    /// They keep their measurement bit for bit, with confidence 1.
+    #[default]
+    Keep,
+    /// They are asked like any other pixel where the plan comes to them, with mask 1 as in the paper where the template has
+    /// mask sentences; where it does not, they are filled from answers.
+    Ask,
+}
+
+/// How far a frame is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Progress {
+    /// Pixels answered so far.
+    pub answered: usize,
+    /// Pixels that will be asked.
+    pub planned: usize,
+}
+
+/// Stops a [`crate::DepthCompleter::complete`] that runs on another thread.
+#[derive(Debug, Clone, Default)]
+pub struct CancelToken(Arc<AtomicBool>);
+
+impl CancelToken {
+    /// Asks to stop; the call returns [`crate::Error::Cancelled`] after the batch that runs.
+    pub fn cancel(&self) {
+        self.0.store(true, Ordering::Relaxed);
+    }
+
+    /// Whether [`CancelToken::cancel`] was called.
+    pub fn is_cancelled(&self) -> bool {
+        self.0.load(Ordering::Relaxed)
+    }
+}
+
+/// Called after each batch of answers.
+pub type ProgressCallback = Arc<dyn Fn(Progress) + Send + Sync>;
+
+/// How to complete a frame.
+#[derive(Clone)]
+pub struct CompleteOptions {
+    /// Which pixels to ask.
+    pub plan: QueryPlan,
+    /// What becomes of measured pixels.
+    pub preserve: Preserve,
+    /// How answers are got; `None` for the checkpoint's own way (`answer_mode` of `sdim.json`).
+    pub answer: Option<AnswerMode>,
+    /// Whether to ask at measured pixels too and to spread the difference over the map, so that it passes through the
+    /// measurements.
+    pub align: bool,
+    /// Bytes that a batch of queries may take beside the weights and the frame, about; smaller batches are slower and give
+    /// the same answers. `None` for batches of 2048 rows.
+    pub max_memory: Option<usize>,
+    /// How pixels that were not asked are filled.
+    pub fill: Arc<dyn Fill>,
+    /// Told after each batch.
+    pub progress: Option<ProgressCallback>,
+    /// Checked after each batch.
+    pub cancel: Option<CancelToken>,
+}
+
+impl Default for CompleteOptions {
+    fn default() -> Self {
+        Self {
+            plan: QueryPlan::default(),
+            preserve: Preserve::default(),
+            answer: None,
+            align: true,
+            max_memory: None,
+            fill: Arc::new(EdgeAwareFill::default()),
+            progress: None,
+            cancel: None,
+        }
+    }
+}
+
+impl std::fmt::Debug for CompleteOptions {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("CompleteOptions")
+            .field("plan", &self.plan)
+            .field("preserve", &self.preserve)
+            .field("answer", &self.answer)
+            .field("align", &self.align)
+            .field("max_memory", &self.max_memory)
+            .finish_non_exhaustive()
+    }
+}

@@ -1,0 +1,4 @@
+//! Files that hold depth.
+
+pub mod npy;
+pub mod png16;

@@ -1,0 +1,121 @@
+//! From a frame to image tokens (Eq. 1-3).
+
+use super::sdim_model::SdimModel;
+use crate::depth::SparseDepth;
+use crate::error::{Error, Result};
+use crate::fusion::Normalise;
+use crate::kernels;
+use crate::query::prompt::Glimpse;
+use crate::vlm::qwen2_5::grid::Grid;
+use crate::vlm::qwen2_5::preprocess::Pixels;
+use candle_core::Tensor;
+use image::RgbImage;
+use rayon::prelude::*;
+
+impl SdimModel {
+    /// Resizes a frame and scatters its measurements: pixels, and `[1, h, w, 1]` in number units with 0 where nothing
+    /// was measured.
+    ///
+    /// # Errors
+    /// [`Error::SizeMismatch`], [`Error::ImageSize`].
+    pub fn preprocess(&self, rgb: &RgbImage, sparse: &SparseDepth) -> Result<(Pixels, Tensor)> {
+        let size = (rgb.width() as usize, rgb.height() as usize);
+        let depth = (sparse.width(), sparse.height());
+        if size != depth {
+            return Err(Error::SizeMismatch { rgb: size, depth });
+        }
+        let pixels = self.preprocessor.resize(rgb)?;
+        let (w, h) = (pixels.resized.width() as usize, pixels.resized.height() as usize);
+        let scattered = scatter(sparse, w, h, self.prompts.unit(sparse));
+        Ok((pixels, Tensor::from_vec(scattered, (1, h, w, 1), &self.device)?))
+    }
+
+    /// Image tokens of a frame with its measurements (Eq. 1-3).
+    ///
+    /// # Errors
+    /// [`Error::Tensors`] on mismatched shapes.
+    pub fn encode(&self, pixels: &Pixels, scattered: &Tensor) -> Result<Tensor> {
+        self.encode_batch(&[pixels], scattered, Normalise::Running)
+    }
+
+    /// Image tokens of frames of one size, one frame after the other; `scattered` is `[frames, h, w, 1]`.
+    ///
+    /// # Errors
+    /// [`Error::Tensors`] on mismatched shapes.
+    pub fn encode_batch(
+        &self,
+        frames: &[&Pixels],
+        scattered: &Tensor,
+        normalise: Normalise,
+    ) -> Result<Tensor> {
+        let grids: Vec<Grid> = frames.iter().map(|p| p.grid).collect();
+        self.vlm.vision.encode(&self.embed_patches(frames, scattered, normalise)?, &grids)
+    }
+
+    /// E of Eq. 3a: embedded patches of frames of one size, `[frames * patches, hidden]`.
+    pub(crate) fn embed_patches(
+        &self,
+        frames: &[&Pixels],
+        scattered: &Tensor,
+        normalise: Normalise,
+    ) -> Result<Tensor> {
+        let patches = frames.iter().map(|p| self.preprocessor.patches(p, &self.device));
+        let patches = Tensor::cat(&patches.collect::<Result<Vec<_>>>()?, 0)?;
+        let mut embedded = self.vlm.vision.patch_embed.forward(&patches)?; // F_e1(I)
+        if let Some(injection) = &self.injection {
+            let images = frames.iter().map(|p| self.preprocessor.image(p, &self.device));
+            let rgb = Tensor::stack(&images.collect::<Result<Vec<_>>>()?, 0)?;
+            let o = injection.fusion.forward(&rgb, scattered, normalise)?;
+            let tokens = frames.iter().enumerate();
+            let tokens = tokens.map(|(i, p)| injection.patch_embed.forward_image(&o.get(i)?, p.grid));
+            embedded = kernels::add(&embedded, &Tensor::cat(&tokens.collect::<Result<Vec<_>>>()?, 0)?)?; // Eq. 3a
+        }
+        Ok(embedded)
+    }
+
+    /// Adds the crop around its pixel to each token that stands at one; `groups` pairs images with the tokens that stand
+    /// in them, indices counting over all of `embedded`. Without a glimpse layer nothing changes.
+    ///
+    /// # Errors
+    /// [`Error::Tensors`] if an index is out of range.
+    pub fn add_glimpses(&self, embedded: Tensor, groups: &[(&RgbImage, &[Glimpse])]) -> Result<Tensor> {
+        let (Some(layer), Some(side)) = (&self.glimpse, self.prompts.settings().glimpse) else {
+            return Ok(embedded);
+        };
+        let count: usize = groups.iter().map(|(_, g)| g.len()).sum();
+        if count == 0 {
+            return Ok(embedded);
+        }
+        let len = 3 * side * side;
+        let mut crops = vec![0f32; count * len];
+        let all: Vec<(&RgbImage, Glimpse)> =
+            groups.iter().flat_map(|(image, list)| list.iter().map(move |g| (*image, *g))).collect();
+        crops.par_chunks_mut(len).zip(&all).for_each(|(crop, (image, g))| {
+            self.preprocessor.crop(image, g.x, g.y, side, crop);
+        });
+        let added = layer.forward(&Tensor::from_vec(crops, (count, len), &self.device)?)?;
+        if all.iter().enumerate().all(|(i, (_, g))| g.token == i) && count == embedded.dim(0)? {
+            return kernels::add(&embedded, &added);
+        }
+        let rows: Vec<u32> = all.iter().map(|(_, g)| g.token as u32).collect();
+        Ok(embedded.index_add(&Tensor::from_vec(rows, count, &self.device)?, &added, 0)?)
+    }
+}
+
+/// Moves measurements to the pixels of the resized frame, in units of `unit` metres, 0 elsewhere. Where several fall on
+/// one pixel, the one nearest to its centre stays: nothing is averaged or interpolated.
+pub fn scatter(sparse: &SparseDepth, width: usize, height: usize, unit: f32) -> Vec<f32> {
+    let mut out = vec![0f32; width * height];
+    let mut off = vec![f32::MAX; width * height];
+    let (sx, sy) = (width as f32 / sparse.width() as f32, height as f32 / sparse.height() as f32);
+    for (x, y, depth) in sparse.points() {
+        let (fx, fy) = ((x as f32 + 0.5) * sx, (y as f32 + 0.5) * sy);
+        let at = (fy as usize).min(height - 1) * width + (fx as usize).min(width - 1);
+        let distance = (fx.fract() - 0.5).powi(2) + (fy.fract() - 0.5).powi(2);
+        if distance < off[at] {
+            off[at] = distance;
+            out[at] = depth / unit;
+        }
+    }
+    out
+}

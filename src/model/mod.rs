@@ -1,0 +1,27 @@
+//! A checkpoint of the depth completion model: Qwen2.5-VL, the fusion block, and the way it is asked.
+//!
+//! A frame goes through `encode` (Eq. 1-3), `prefix` (what all of its queries share) and `ask` (batches of queries).
+
+mod adapter;
+mod ask;
+mod batch;
+mod encode;
+mod files;
+mod generate;
+mod load;
+mod marked;
+mod parts;
+mod prefix;
+mod sdim_model;
+
+pub use adapter::Adapter;
+pub use ask::{ask, ask_as, ask_within, generate};
+pub use encode::scatter;
+pub use files::{CheckpointFiles, SETTINGS, TENSORS};
+pub use generate::Spoken;
+pub use load::LoadOptions;
+#[cfg(feature = "tiny")]
+pub use load::tiny;
+pub use parts::DepthInjection;
+pub use prefix::{Encoded, Prefix};
+pub use sdim_model::SdimModel;

@@ -1,0 +1,108 @@
+//! From a frame to what all of its queries share.
+
+use super::marked::MarkedFrame;
+use super::sdim_model::SdimModel;
+use crate::depth::SparseDepth;
+use crate::error::Result;
+use crate::kernels;
+use crate::query::prompt::FrameSpace;
+use crate::query::settings::PixelReference;
+use crate::vlm::qwen2_5::cache::KvCache;
+use crate::vlm::qwen2_5::decoder::Keep;
+use crate::vlm::qwen2_5::preprocess::Pixels;
+use candle_core::Tensor;
+use image::RgbImage;
+use std::sync::Arc;
+
+/// What all queries of a frame share: its keys and values, read once, and its space.
+pub struct Prefix {
+    /// Keys and values of the prefix tokens. Where each query marks the image for itself, of those before the image.
+    pub cache: KvCache,
+    /// Ids of the prefix tokens.
+    pub ids: Vec<u32>,
+    /// Where pixels lie, and what numbers mean.
+    pub space: FrameSpace,
+    /// The resized frame, for the crops around pixels.
+    pub image: Arc<RgbImage>,
+    /// The frame that each query marks for itself, for [`PixelReference::Marker`].
+    pub marked: Option<MarkedFrame>,
+}
+
+/// A frame as its queries need it.
+pub enum Encoded {
+    /// Image tokens that are the same for all queries.
+    Once(Tensor),
+    /// A frame that is encoded for each query, with its mark.
+    PerQuery(Box<MarkedFrame>),
+}
+
+impl SdimModel {
+    /// Encodes a frame as the checkpoint's pixel reference needs it; `pixels` and `scattered` are what
+    /// [`SdimModel::preprocess`] gave for `rgb`.
+    ///
+    /// # Errors
+    /// [`crate::Error::Config`] if the frame is too small for the checkpoint's mark; [`crate::Error::Tensors`] on mismatched shapes.
+    pub fn encode_frame(&self, rgb: &RgbImage, pixels: &Pixels, scattered: &Tensor) -> Result<Encoded> {
+        match self.prompts.settings().pixel_reference {
+            PixelReference::Marker(marker) => {
+                let frame = MarkedFrame::new(self, marker, rgb, pixels, scattered)?;
+                Ok(Encoded::PerQuery(Box::new(frame)))
+            }
+            _ => Ok(Encoded::Once(kernels::in_pool(|| self.encode(pixels, scattered))?)),
+        }
+    }
+
+    /// From a frame to what its queries share, in one go.
+    ///
+    /// # Errors
+    /// As [`SdimModel::preprocess`] and [`SdimModel::encode_frame`].
+    pub fn read_frame(&self, rgb: &RgbImage, sparse: &SparseDepth) -> Result<Prefix> {
+        let (pixels, scattered) = self.preprocess(rgb, sparse)?;
+        let encoded = self.encode_frame(rgb, &pixels, &scattered)?;
+        self.read_encoded(&pixels, encoded, sparse)
+    }
+
+    /// Reads what all queries of an encoded frame share.
+    ///
+    /// # Errors
+    /// [`crate::Error::Tensors`] on mismatched shapes.
+    pub fn read_encoded(&self, pixels: &Pixels, encoded: Encoded, sparse: &SparseDepth) -> Result<Prefix> {
+        let frame = match encoded {
+            Encoded::Once(tokens) => {
+                return kernels::in_pool(|| self.read_prefix(pixels, &tokens, sparse));
+            }
+            Encoded::PerQuery(frame) => *frame,
+        };
+        let resized = (pixels.resized.width() as usize, pixels.resized.height() as usize);
+        let (tokens, space) = self.prompts.prefix(sparse, pixels.grid, resized, &self.vlm.config, 0)?;
+        let image = tokens.ids.iter().position(|&id| id == self.vlm.config.ids.image);
+        let (shared, opening) = tokens.split(image.unwrap_or(0));
+        let mut cache = self.vlm.decoder.cache(1);
+        if !shared.is_empty() {
+            let embedded = self.vlm.decoder.embed(&shared.ids)?;
+            self.vlm.prefill(&embedded, &shared.positions, &mut cache, Keep::Nothing)?;
+        }
+        let image = Arc::new(pixels.resized.clone());
+        Ok(Prefix { cache, ids: shared.ids, space, image, marked: Some(frame.with_opening(opening)) })
+    }
+
+    /// Reads the shared prefix of a frame into a cache, for pixel references that leave the image as it is.
+    ///
+    /// # Errors
+    /// [`crate::Error::Tensors`] on mismatched shapes.
+    pub fn read_prefix(
+        &self,
+        pixels: &Pixels,
+        image_tokens: &Tensor,
+        sparse: &SparseDepth,
+    ) -> Result<Prefix> {
+        let resized = (pixels.resized.width() as usize, pixels.resized.height() as usize);
+        let (tokens, space) = self.prompts.prefix(sparse, pixels.grid, resized, &self.vlm.config, 0)?;
+        let image = Arc::new(pixels.resized.clone());
+        let embedded = self.vlm.embed_prompt(&tokens.ids, image_tokens)?;
+        let embedded = self.add_glimpses(embedded, &[(&image, &tokens.glimpses)])?;
+        let mut cache = self.vlm.decoder.cache(1);
+        self.vlm.prefill(&embedded, &tokens.positions, &mut cache, Keep::Nothing)?;
+        Ok(Prefix { cache, ids: tokens.ids, space, image, marked: None })
+    }
+}

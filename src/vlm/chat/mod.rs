@@ -1,0 +1,8 @@
+//! A checkpoint that is spoken with: tokenizer, chat template, answers in words.
+
+pub mod generate;
+mod model;
+pub mod template;
+pub mod tokenizer;
+
+pub use model::{Answer, AnswerOptions, ChatModel};

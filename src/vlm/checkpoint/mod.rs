@@ -1,0 +1,10 @@
+//! Tensors of a checkpoint by name: files, shards, stored types, what an adapter adds.
+
+pub(crate) mod json;
+pub mod lora;
+pub(crate) mod raw;
+pub(crate) mod shards;
+mod stored;
+pub mod weights;
+
+pub(crate) use stored::StoredFile;

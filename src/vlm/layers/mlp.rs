@@ -1,0 +1,54 @@
+//! The gated MLP of both towers.
+
+use super::linear::{Found, Linear};
+use super::matrix::Matrix;
+use crate::error::Result;
+use crate::kernels::{self, PackedGate};
+use crate::vlm::checkpoint::weights::Weights;
+use candle_core::Tensor;
+
+/// The two projections of a gated MLP that read the same input.
+pub(super) enum GateUp {
+    Apart { gate: Linear, up: Linear },
+    Joined(PackedGate),
+}
+
+/// `down(silu(gate x) * up x)`, the MLP of both towers.
+pub struct GatedMlp {
+    pub(super) inputs: GateUp,
+    down: Linear,
+}
+
+impl GatedMlp {
+    /// Reads `{name}.gate_proj`, `.up_proj` and `.down_proj`.
+    ///
+    /// # Errors
+    /// As [`Weights::get`].
+    pub fn new(weights: &Weights, name: &str, width: usize, inner: usize, bias: bool) -> Result<Self> {
+        let found = |part| Found::new(weights, &format!("{name}.{part}"), width, inner, bias);
+        let (gate, up) = (found("gate_proj")?, found("up_proj")?);
+        let inputs = if gate.joins() && up.joins() {
+            let (g, u) = (gate.weight.hold()?, up.weight.hold()?);
+            let (g, u) = ((g.rows()?, gate.bias.as_ref()), (u.rows()?, up.bias.as_ref()));
+            GateUp::Joined(PackedGate::new(weights.format(), g, u)?)
+        } else {
+            GateUp::Apart { gate: gate.keep()?, up: up.keep()? }
+        };
+        Ok(Self { inputs, down: Linear::new(weights, &format!("{name}.down_proj"), inner, width, bias)? })
+    }
+
+    /// Its output for `x` added to `residual`: `[n, width]` each, as the result.
+    ///
+    /// # Errors
+    /// [`crate::Error::Argument`] or [`crate::Error::Tensors`] on another width.
+    pub fn forward_onto(&self, x: &Tensor, residual: &Tensor) -> Result<Tensor> {
+        let gated = match (&self.inputs, &self.down) {
+            (GateUp::Joined(both), Linear { weight: Matrix::Packed(down), bias, lora: None }) => {
+                return both.apply_onto(x, down, bias.as_ref(), residual);
+            }
+            (GateUp::Joined(both), _) => both.apply(x)?,
+            (GateUp::Apart { gate, up }, _) => kernels::swiglu(&gate.forward(x)?, &up.forward(x)?)?,
+        };
+        self.down.forward_onto(&gated, residual)
+    }
+}

@@ -1,0 +1,18 @@
+//! The architecture of Qwen2.5-VL: preprocessing, vision encoder, M-RoPE, decoder, cache.
+//!
+//! Tokens are rows of `[tokens, width]` tensors; there is no batch axis and no padding. Structs and names are those of the
+//! published checkpoints.
+
+pub mod cache;
+pub mod config;
+pub mod decoder;
+pub mod grid;
+mod model;
+pub mod patch_embed;
+pub mod positions;
+pub mod preprocess;
+pub mod rope;
+pub mod sequences;
+pub mod vision;
+
+pub use model::QwenVl;
