@@ -1,8 +1,87 @@
-#![cfg_attr(feature = "tiny", doc = include_str!("../README.md"))]
-#![cfg_attr(
-    not(feature = "tiny"),
-    doc = "Dense metric depth from an RGB frame and sparse depth, by asking a VLM."
-)]
+//! Dense metric depth from an RGB frame and sparse depth, by asking a vision-language model how far each pixel is.
+//!
+//! # The way of a frame
+//!
+//! 1. The picture is resized as the checkpoint wants it; the measurements are scattered into it, never interpolated.
+//! 2. The fusion block turns both into an image that is added to the picture's patches (Eq. 1 to 3a of the paper).
+//! 3. The vision encoder makes image tokens of the patches.
+//! 4. Text, image tokens and measurements (numbers at their pixels) are read once: the shared prefix.
+//! 5. A [`QueryPlan`] says which pixels are asked.
+//! 6. Each question is a short suffix that names its pixel; thousands are read in one batch against the prefix.
+//! 7. Each answer is a distribution over numbers: a depth, a confidence, an expected error.
+//! 8. Answers are aligned, so that the map passes through the measurements.
+//! 9. Pixels that were not asked are filled along surfaces, never across a depth edge.
+//! 10. Measured pixels keep their measurement bit for bit: a [`DepthMap`].
+//!
+//! [`DepthCompleter::complete`] does all of it:
+//!
+//! ```
+//! # #[cfg(feature = "tiny")]
+//! # fn main() -> sdim::Result<()> {
+//! use sdim::{CompleteOptions, DepthCompleter, QueryPlan, SparseDepth};
+//!
+//! let completer = DepthCompleter::tiny()?; // share it between threads; clones are cheap
+//! let rgb = image::RgbImage::from_pixel(64, 48, image::Rgb([90, 120, 60]));
+//! let sparse = SparseDepth::from_points(64, 48, &[(5, 5, 2.0), (60, 8, 2.5), (30, 40, 1.2)])?; // x, y, metres
+//! let mut options = CompleteOptions::default();
+//! options.plan = QueryPlan::Stride(2);
+//! let dense = completer.complete(&rgb, &sparse, &options)?;
+//! assert_eq!(dense.get(30, 40), Some(1.2));
+//! assert_eq!(dense.valid(), 64 * 48);
+//! # Ok(())
+//! # }
+//! # #[cfg(not(feature = "tiny"))]
+//! # fn main() {}
+//! ```
+//!
+//! With files and a checkpoint of one's own; the unit of an integer file must be told:
+//!
+//! ```no_run
+//! use sdim::{CompleteOptions, DepthCompleter, DepthScale, SparseDepth, read_rgb};
+//!
+//! let completer = DepthCompleter::load("checkpoint-dir", &candle_core::Device::Cpu)?;
+//! let rgb = read_rgb("frame.png")?;
+//! let sparse = SparseDepth::read("lidar.png", Some(DepthScale::kitti()))?; // 16 bits, 1/256 m
+//! let dense = completer.complete(&rgb, &sparse, &CompleteOptions::default())?;
+//! dense.write_npy("dense.npy")?; // metres, f32, NaN where there is no depth
+//! # Ok::<(), sdim::Error>(())
+//! ```
+//!
+//! # Units
+//!
+//! Depth is Z-depth (along the optical axis), in metres, `f32`, row-major; x grows to the right, y downwards. Missing on input: 0, NaN,
+//! infinite or negative. Missing in memory: NaN. Missing in integer files: 0. A confidence lies between 0 and 1 and is the probability, as
+//! the model sees it, that the truth lies within 5 % of the answer; expected errors are absolute, in metres.
+//!
+//! # Modules
+//!
+//! | module | what |
+//! |---|---|
+//! | [`complete`] | one frame, start to end: options, progress, cancelling |
+//! | [`depth`] | sparse and dense maps, cameras, sampling patterns, files, interpolation |
+//! | `classical`, `metrics`, `draw` | completion without a model; errors and intervals; colours and figures |
+//! | [`refine`] | the trait `Fill`: how pixels that were not asked are filled |
+//! | [`model`], [`query`] | how a checkpoint is loaded and asked: [`LoadOptions`], adapters, the settings in `sdim.json` |
+//! | [`vlm`] | plain Qwen2.5-VL: ask a published checkpoint about a picture (`ChatModel`) |
+//! | [`error`] | the one error type |
+//! | `scenes`, `supervise`, `benchmarks`, `hub` | procedural scenes, training, data sets, the Hugging Face hub; each behind its feature |
+//!
+//! # Features
+//!
+//! | feature | default | what |
+//! |---|---|---|
+//! | `tiny` | yes | the embedded checkpoint: [`DepthCompleter`]`::tiny` |
+//! | `train` | no | `scenes` and `supervise` |
+//! | `benchmarks` | no | `benchmarks`: NYUv2, VOID, iBims-1, KITTI, DDAD, TUM, ScanNet, folders |
+//! | `hub` | no | `hub`: checkpoints by name; the one feature that builds C |
+//! | `cuda`, `cudnn`, `metal`, `accelerate`, `mkl` | no | candle's back ends |
+//!
+//! # Promises
+//!
+//! Bad input is an [`Error`] that says what, where, and what was expected; nothing panics, prints, or guesses a unit. A loaded model is immutable
+//! and `Send + Sync`. The same frame gives the same map, whatever the number of threads. CPU kernels are chosen at run time; the variable
+//! `SDIM_KERNEL` (`portable`, `avx2`, `avx512`, `amx`, `neon`) forces one, and [`WeightFormat`] says how matrices are held.
+
 #![deny(missing_docs)]
 #![deny(unsafe_op_in_unsafe_fn)]
 #![warn(clippy::all)]
@@ -38,3 +117,8 @@ pub use error::{Error, Result};
 pub use kernels::WeightFormat;
 pub use model::{LoadOptions, SdimModel};
 pub use query::{AnswerMode, QueryPlan};
+
+/// The snippet of README.md is a test.
+#[cfg(all(doctest, feature = "tiny"))]
+#[doc = include_str!("../README.md")]
+struct ReadmeDoctests;
