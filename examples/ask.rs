@@ -10,7 +10,7 @@ use clap::Parser;
 use sdim::kernels::WeightFormat;
 use sdim::read_rgb;
 use sdim::system::device;
-use sdim::vlm::chat::{AnswerOptions, ChatModel};
+use sdim::vlm::chat::{AnswerOptions, ChatModel, Sampling};
 use serde_json::json;
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -32,6 +32,15 @@ struct Args {
     /// 1 is off; without it, as the checkpoint's generation_config.json says.
     #[arg(long)]
     repetition_penalty: Option<f32>,
+    /// Draws tokens at random, at this temperature (0.7, say), instead of taking the likeliest one.
+    #[arg(long)]
+    temperature: Option<f64>,
+    /// Draws among the likeliest tokens whose probabilities sum up to this.
+    #[arg(long, requires = "temperature")]
+    top_p: Option<f64>,
+    /// The same seed gives the same answer.
+    #[arg(long, requires = "temperature", default_value_t = 0)]
+    seed: u64,
     /// How matrices are held: f32, bf16 (half the memory) or int8 (a quarter).
     #[arg(long, default_value = "f32")]
     dtype: WeightFormat,
@@ -60,6 +69,11 @@ fn run(args: &Args) -> sdim::Result<String> {
     let options = AnswerOptions {
         max_new_tokens: args.max_new_tokens,
         repetition_penalty: args.repetition_penalty,
+        sampling: args.temperature.map(|temperature| Sampling {
+            temperature,
+            top_p: args.top_p,
+            seed: args.seed,
+        }),
         ..Default::default()
     };
     let answer = model.answer(&image, &args.prompt, &options)?;

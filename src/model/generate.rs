@@ -6,10 +6,11 @@ use crate::error::{Error, Result};
 use crate::query::grammar::AnswerGrammar;
 use crate::query::mode::Generation;
 use crate::query::number::{CONFIDENT_WITHIN, NumberFormat, Reading};
-use crate::vlm::chat::generate::penalise;
 use crate::vlm::chat::tokenizer::Tokenizer;
-use candle_core::DType;
+use candle_core::{DType, Device, Tensor};
+use candle_transformers::utils::apply_repeat_penalty;
 use rayon::prelude::*;
+use std::borrow::Cow;
 use std::ops::Range;
 
 /// Logits that are looked at in one piece, at most: 64 MiB in f32.
@@ -104,17 +105,26 @@ impl<'a> Voice<'a> {
             let count = rows.min(alive.len() - first);
             let logits =
                 decoder.logits(&batch.sequences.last().narrow(0, first, count)?)?.to_dtype(DType::F32)?;
-            let mut logits: Vec<f32> = logits.flatten_all()?.to_vec1()?;
-            choices.par_extend(logits.par_chunks_mut(vocab).enumerate().map(|(row, logits)| {
-                if self.generation.repetition_penalty != 1.0 {
-                    let row = first + row;
-                    let said = out[alive[row]].ids.iter().copied();
-                    penalise(logits, batch.prompt(row).chain(said), self.generation.repetition_penalty);
-                }
-                self.likeliest(&logits[..self.usable.min(vocab)])
-            }));
+            let logits: Vec<f32> = logits.flatten_all()?.to_vec1()?;
+            let chosen = logits.par_chunks(vocab).enumerate().map(|(row, logits)| {
+                let row = first + row;
+                let said = out[alive[row]].ids.iter().copied();
+                let penalised = self.penalised(logits, || batch.prompt(row).chain(said).collect())?;
+                Ok(self.likeliest(&penalised[..self.usable.min(vocab)]))
+            });
+            choices.extend(chosen.collect::<Result<Vec<_>>>()?);
         }
         Ok(choices)
+    }
+
+    /// Logits in which the tokens seen so far are less likely, as the reference's generation does.
+    fn penalised<'l>(&self, logits: &'l [f32], seen: impl FnOnce() -> Vec<u32>) -> Result<Cow<'l, [f32]>> {
+        let penalty = self.generation.repetition_penalty;
+        if penalty == 1.0 {
+            return Ok(Cow::Borrowed(logits));
+        }
+        let tensor = Tensor::from_slice(logits, logits.len(), &Device::Cpu)?;
+        Ok(Cow::Owned(apply_repeat_penalty(&tensor, penalty, &seen())?.to_vec1()?))
     }
 
     /// The first of the likeliest tokens; `None` if the logits are not numbers.

@@ -122,6 +122,7 @@ impl Case<'_> {
             let options = GenerateOptions {
                 max_new_tokens: self.golden.integers(&self.key(name)).len(),
                 repetition_penalty: penalty,
+                sampling: None,
                 stop_ids: Vec::new(),
                 usable_vocab: self.model.config.text.vocab_size,
             };

@@ -8,7 +8,8 @@ use crate::vlm::qwen2_5::decoder::Keep;
 use crate::vlm::qwen2_5::rope::Position;
 use crate::vlm::qwen2_5::sequences::Sequences;
 use candle_core::{DType, Tensor};
-use candle_transformers::generation::{LogitsProcessor, Sampling};
+use candle_transformers::generation::{self, LogitsProcessor};
+use candle_transformers::utils::apply_repeat_penalty;
 use serde_json::Value;
 use std::path::Path;
 
@@ -18,8 +19,8 @@ const STOP_IDS: &str = "eos_token_id";
 
 /// What a checkpoint says about generation, `generation_config.json`.
 ///
-/// The published files ask for sampling at a temperature of 1e-6, which is greedy in all but name; this crate generates
-/// greedily and reads no sampling keys.
+/// The published files ask for sampling at a temperature of 1e-6, which is greedy in all but name; this crate answers greedily
+/// unless [`Sampling`] is asked for, and reads no sampling keys.
 #[derive(Debug, Clone, PartialEq)]
 pub struct GenerationConfig {
     /// `repetition_penalty`; 1, which is off, where the file or the key is absent. Published: 1.05.
@@ -67,6 +68,43 @@ fn stop_ids(file: &str, json: &Value) -> Result<Vec<u32>> {
     ids.ok_or_else(|| Error::config(file, STOP_IDS, value.to_string(), "a token id or a list of them"))
 }
 
+/// Tokens drawn at random instead of the likeliest ones.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Sampling {
+    /// Divides the logits before the softmax: below 1 for safer, above 1 for wilder answers; positive.
+    pub temperature: f64,
+    /// The least set of likeliest tokens whose probabilities sum up to this, above 0 and at most 1; `None` for all tokens.
+    pub top_p: Option<f64>,
+    /// The same seed gives the same answer.
+    pub seed: u64,
+}
+
+impl Sampling {
+    fn check(&self) -> Result<()> {
+        if !(self.temperature.is_finite() && self.temperature > 0.0) {
+            let expected = "a positive, finite number; no sampling at all is greedy";
+            return Err(Error::argument("temperature", self.temperature, expected));
+        }
+        match self.top_p {
+            Some(p) if !(p > 0.0 && p <= 1.0) => Err(Error::argument("top_p", p, "above 0 and at most 1")),
+            _ => Ok(()),
+        }
+    }
+
+    /// What chooses the next token.
+    fn processor(sampling: Option<&Self>) -> LogitsProcessor {
+        let greedy = LogitsProcessor::from_sampling(0, generation::Sampling::ArgMax);
+        sampling.map_or(greedy, |s| {
+            let (p, temperature) = (s.top_p, s.temperature);
+            let kind = match p {
+                Some(p) => generation::Sampling::TopP { p, temperature },
+                None => generation::Sampling::All { temperature },
+            };
+            LogitsProcessor::from_sampling(s.seed, kind)
+        })
+    }
+}
+
 /// How to continue a prompt.
 #[derive(Debug, Clone)]
 pub struct GenerateOptions {
@@ -74,6 +112,8 @@ pub struct GenerateOptions {
     pub max_new_tokens: usize,
     /// Divides (or multiplies, if negative) the logit of every id seen so far; 1 is off. Published: 1.05.
     pub repetition_penalty: f32,
+    /// How tokens are drawn; `None` for the likeliest one each time.
+    pub sampling: Option<Sampling>,
     /// Ids that end the answer (not returned).
     pub stop_ids: Vec<u32>,
     /// Ids from this one on have no token and are never chosen.
@@ -84,7 +124,8 @@ impl GenerateOptions {
     /// Checks the values that a user may set.
     ///
     /// # Errors
-    /// [`Error::Argument`] if no token is asked for, or on a penalty that is not a positive, finite number.
+    /// [`Error::Argument`] if no token is asked for, on a penalty or temperature that is not a positive, finite number, or a
+    /// `top_p` outside 0 to 1.
     pub fn check(&self) -> Result<()> {
         if self.max_new_tokens == 0 {
             return Err(Error::argument("max_new_tokens", 0, "at least 1"));
@@ -93,12 +134,12 @@ impl GenerateOptions {
             let expected = "a positive, finite number; 1 is off";
             return Err(Error::argument("repetition_penalty", self.repetition_penalty, expected));
         }
-        Ok(())
+        self.sampling.as_ref().map_or(Ok(()), Sampling::check)
     }
 }
 
 impl QwenVl {
-    /// Continues a prompt greedily.
+    /// Continues a prompt.
     ///
     /// `embedded` is `[tokens, hidden]` with one position per token, `next` the position that follows, `ids` the prompt.
     ///
@@ -129,7 +170,7 @@ impl QwenVl {
         options: &GenerateOptions,
         watch: &mut dyn FnMut(&Tensor) -> Result<()>,
     ) -> Result<Vec<u32>> {
-        let mut sampler = LogitsProcessor::from_sampling(0, Sampling::ArgMax);
+        let mut sampler = Sampling::processor(options.sampling.as_ref());
         let mut prompt = self.decoder.cache(1);
         let hidden = self.prefill(embedded, positions, &mut prompt, Keep::Last)?;
         // The answer has a cache of its own, since a cache is copied when it grows.
@@ -146,9 +187,8 @@ impl QwenVl {
             let logits = if options.repetition_penalty == 1.0 {
                 logits
             } else {
-                let mut values = logits.to_vec1::<f32>()?;
-                penalise(&mut values, ids.iter().chain(&answer).copied(), options.repetition_penalty);
-                Tensor::from_vec(values, usable, logits.device())?
+                let seen: Vec<u32> = ids.iter().chain(&answer).copied().collect();
+                apply_repeat_penalty(&logits, options.repetition_penalty, &seen)?
             };
             let id = sampler.sample(&logits)?;
             if options.stop_ids.contains(&id) {
@@ -157,18 +197,6 @@ impl QwenVl {
             answer.push(id);
         }
         Ok(answer)
-    }
-}
-
-/// Makes the tokens that were seen less likely, once each, as the reference's generation does.
-pub(crate) fn penalise(logits: &mut [f32], seen: impl Iterator<Item = u32>, penalty: f32) {
-    let mut seen: Vec<u32> = seen.collect();
-    seen.sort_unstable();
-    seen.dedup();
-    for id in seen {
-        if let Some(l) = logits.get_mut(id as usize) {
-            *l = if *l < 0.0 { *l * penalty } else { *l / penalty };
-        }
     }
 }
 
@@ -228,6 +256,7 @@ mod tests {
         let with = |max_new_tokens, repetition_penalty| GenerateOptions {
             max_new_tokens,
             repetition_penalty,
+            sampling: None,
             stop_ids: vec![],
             usable_vocab: 1,
         };
@@ -239,9 +268,42 @@ mod tests {
     }
 
     #[test]
-    fn penalties_count_once_and_push_down() {
-        let mut logits = [2.0, -2.0, 1.0];
-        penalise(&mut logits, [0, 1, 0, 77].into_iter(), 2.0);
-        assert_eq!(logits, [1.0, -4.0, 1.0]);
+    fn sampling_out_of_range_is_refused() {
+        let check = |temperature, top_p| Sampling { temperature, top_p, seed: 0 }.check();
+        assert!(check(0.7, None).is_ok() && check(1.0, Some(1.0)).is_ok() && check(2.0, Some(0.1)).is_ok());
+        let bad = [
+            (0.0, None),
+            (-1.0, None),
+            (f64::NAN, None),
+            (f64::INFINITY, None),
+            (1.0, Some(0.0)),
+            (1.0, Some(1.1)),
+        ];
+        for (temperature, top_p) in bad {
+            assert!(
+                matches!(check(temperature, top_p), Err(Error::Argument { .. })),
+                "{temperature} {top_p:?}"
+            );
+        }
+    }
+
+    #[test]
+    fn draws_follow_temperature_top_p_and_seed() {
+        let logits = Tensor::new(&[2.0f32, 1.0, 0.0, -8.0], &candle_core::Device::Cpu).unwrap();
+        let draws = |sampling: Option<Sampling>| -> Vec<u32> {
+            let mut processor = Sampling::processor(sampling.as_ref());
+            (0..200).map(|_| processor.sample(&logits).unwrap()).collect()
+        };
+        let sampled = |temperature, top_p, seed| draws(Some(Sampling { temperature, top_p, seed }));
+        let seen = |draws: &[u32], id: u32| draws.iter().filter(|d| **d == id).count();
+        assert_eq!(seen(&draws(None), 0), 200);
+        let warm = sampled(1.0, None, 1);
+        assert!((100..170).contains(&seen(&warm, 0)) && seen(&warm, 1) > 20 && seen(&warm, 2) > 2);
+        assert_eq!(warm, sampled(1.0, None, 1));
+        assert_ne!(warm, sampled(1.0, None, 2));
+        assert!(seen(&sampled(0.1, None, 1), 0) >= 199);
+        // The likeliest token alone has 0.665.
+        assert_eq!(seen(&sampled(1.0, Some(0.5), 1), 0), 200);
+        assert_eq!(seen(&sampled(1.0, Some(0.8), 1), 2), 0);
     }
 }

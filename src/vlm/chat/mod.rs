@@ -5,4 +5,5 @@ mod model;
 pub mod template;
 pub mod tokenizer;
 
+pub use generate::Sampling;
 pub use model::{Answer, AnswerOptions, ChatModel};

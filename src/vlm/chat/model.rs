@@ -1,6 +1,6 @@
 //! A checkpoint that answers questions about images: plain Qwen2.5-VL, as published.
 
-use super::generate::{GenerateOptions, GenerationConfig};
+use super::generate::{GenerateOptions, GenerationConfig, Sampling};
 use super::template::{ChatPrompt, IMAGE_PLACEHOLDER, Part};
 use super::tokenizer::Tokenizer;
 use crate::error::{Error, Result};
@@ -23,7 +23,7 @@ const TOP: usize = 20;
 /// A published Qwen2.5-VL checkpoint, or a fine-tune of one, to talk to. Immutable: share it by `Arc`.
 ///
 /// ```no_run
-/// use sdim::vlm::{AnswerOptions, ChatModel};
+/// use sdim::vlm::chat::{AnswerOptions, ChatModel};
 /// let model = ChatModel::load("Qwen2.5-VL-3B-Instruct", &candle_core::Device::Cpu)?;
 /// let image = sdim::read_rgb("kitchen.jpg")?;
 /// let answer = model.answer(&image, "How far is the kettle?", &AnswerOptions::default())?;
@@ -50,13 +50,15 @@ pub struct AnswerOptions {
     pub max_new_tokens: usize,
     /// Divides (multiplies, if negative) the logit of every id of the prompt and the answer so far; positive, 1 is off.
     pub repetition_penalty: Option<f32>,
+    /// How tokens are drawn; `None` for the likeliest one each time.
+    pub sampling: Option<Sampling>,
     /// Ids that end the answer.
     pub stop_ids: Option<Vec<u32>>,
 }
 
 impl Default for AnswerOptions {
     fn default() -> Self {
-        Self { max_new_tokens: 128, repetition_penalty: None, stop_ids: None }
+        Self { max_new_tokens: 128, repetition_penalty: None, sampling: None, stop_ids: None }
     }
 }
 
@@ -116,7 +118,7 @@ impl ChatModel {
         self.reply(&prompt, &[image], options)
     }
 
-    /// Continues a conversation greedily; `images` are those of the conversation, in order.
+    /// Continues a conversation; `images` are those of the conversation, in order.
     ///
     /// # Errors
     /// [`Error::Argument`] on an option out of range or if the images are not as many as the conversation shows;
@@ -131,6 +133,7 @@ impl ChatModel {
         let options = GenerateOptions {
             max_new_tokens: options.max_new_tokens,
             repetition_penalty: options.repetition_penalty.unwrap_or(defaults.repetition_penalty),
+            sampling: options.sampling,
             stop_ids: options.stop_ids.as_ref().unwrap_or(&defaults.stop_ids).clone(),
             usable_vocab: self.usable_vocab,
         };
