@@ -3,15 +3,15 @@
 use std::path::{Path, PathBuf};
 
 use super::files::{all_taken, depth, first_with, list, list_some, picture, some_valid, take, unpaired};
+use super::listing::{Frame, Loader};
 use super::outliers::{THRESHOLD, WINDOW, remove_outliers};
-use super::{Dataset, Sample, entry, frame_seed};
+use super::{Sample, frame_seed};
 use crate::depth::{DepthScale, SparseDepth};
 use crate::error::Result;
 use crate::scenes::sample_points;
 
 #[derive(Clone, Debug)]
-struct Entry {
-    name: String,
+pub(super) struct Files {
     rgb: PathBuf,
     gt: PathBuf,
     hints: Option<PathBuf>,
@@ -26,7 +26,7 @@ struct Entry {
 /// protocol's. Either way the points go through [`remove_outliers`] as on KITTI; the ground truth does not.
 #[derive(Clone, Debug)]
 pub struct DdadDataset {
-    entries: Vec<Entry>,
+    frames: Vec<Frame<Files>>,
     seed: u64,
 }
 
@@ -40,7 +40,7 @@ impl DdadDataset {
         let hints_dir = dir.join("hints");
         let mut truths = list(&dir.join("gt"), &["png"])?;
         let mut hints = if hints_dir.is_dir() { Some(list(&hints_dir, &["png"])?) } else { None };
-        let mut entries = Vec::new();
+        let mut frames = Vec::new();
         for (name, rgb) in list_some(&dir.join("rgb"), &["png"])? {
             let lacks = |kind: &str| unpaired(&rgb, kind, format!("{kind}/{name}.png"));
             let gt = take(&mut truths, &name).ok_or_else(|| lacks("gt"))?;
@@ -48,29 +48,27 @@ impl DdadDataset {
                 Some(files) => Some(take(files, &name).ok_or_else(|| lacks("hints"))?),
                 None => None,
             };
-            entries.push(Entry { name, rgb, gt, hints });
+            frames.push(Frame { name, files: Files { rgb, gt, hints } });
         }
         truths.extend(hints.unwrap_or_default());
         all_taken(truths, |name| format!("rgb/{name}.png"))?;
-        Ok(Self { entries, seed })
+        Ok(Self { frames, seed })
     }
 }
 
-impl Dataset for DdadDataset {
-    fn len(&self) -> usize {
-        self.entries.len()
+impl Loader for DdadDataset {
+    type Files = Files;
+
+    fn frames(&self) -> &[Frame<Files>] {
+        &self.frames
     }
 
-    fn name(&self, index: usize) -> String {
-        self.entries.get(index).map(|e| e.name.clone()).unwrap_or_default()
+    fn brings_measurements(&self, _: &Files) -> bool {
+        true
     }
 
-    fn has_measurements(&self, index: usize) -> bool {
-        index < self.entries.len()
-    }
-
-    fn load(&self, index: usize) -> Result<Sample> {
-        let Entry { name, rgb, gt: gt_path, hints } = entry(&self.entries, index)?;
+    fn read(&self, frame: &Frame<Files>, index: usize) -> Result<Sample> {
+        let Files { rgb, gt: gt_path, hints } = &frame.files;
         let scale = Some(DepthScale::kitti());
         let rgb = picture(rgb)?;
         let gt = depth(gt_path, scale, &rgb)?;
@@ -81,7 +79,7 @@ impl Dataset for DdadDataset {
         let kept = remove_outliers(&chosen, WINDOW, THRESHOLD)?;
         let sparse = some_valid(hints.as_ref().unwrap_or(gt_path), kept)?;
         Ok(Sample {
-            name: name.clone(),
+            name: frame.name.clone(),
             rgb,
             gt: gt.as_slice().to_vec(),
             sparse: Some(sparse),

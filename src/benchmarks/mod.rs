@@ -15,6 +15,7 @@ mod folder;
 mod hdf5;
 mod ibims;
 mod kitti;
+mod listing;
 mod lzf;
 mod mat;
 mod nyu;
@@ -281,9 +282,4 @@ impl Dataset for Ranged {
         }
         Ok(sample)
     }
-}
-
-/// The entry of a frame, or the error for an index beyond the last.
-fn entry<T>(entries: &[T], index: usize) -> Result<&T> {
-    entries.get(index).ok_or_else(|| Error::argument("index", index, format!("below {}", entries.len())))
 }

@@ -6,7 +6,8 @@ use image::RgbImage;
 
 use super::files::{Listed, list_some, naming, some_valid};
 use super::hdf5::Numbers;
-use super::{Dataset, Sample, entry};
+use super::listing::entry;
+use super::{Dataset, Sample};
 use crate::depth::SparseDepth;
 use crate::error::{Error, Result};
 

@@ -2,17 +2,17 @@
 
 use std::path::{Path, PathBuf};
 
+use super::Sample;
 use super::files::{
     PICTURES, all_taken, frame_name, list, list_some, naming, picture, recordings, some_valid, take, unpaired,
 };
-use super::{Dataset, Sample, entry};
+use super::listing::{Frame, Loader};
 use crate::depth::{DepthScale, SparseDepth};
 use crate::error::{Error, Result};
 use crate::vlm::resize::bicubic;
 
 #[derive(Clone, Debug)]
-struct Entry {
-    name: String,
+pub(super) struct Files {
     rgb: PathBuf,
     gt: PathBuf,
 }
@@ -25,7 +25,7 @@ struct Entry {
 /// in order of their numbers and have no measurements of their own.
 #[derive(Clone, Debug)]
 pub struct ScanNetDataset {
-    entries: Vec<Entry>,
+    frames: Vec<Frame<Files>>,
 }
 
 impl ScanNetDataset {
@@ -34,7 +34,7 @@ impl ScanNetDataset {
     /// # Errors
     /// [`Error::Io`]; [`Error::Format`] naming the file that lacks a partner.
     pub fn open(dir: impl AsRef<Path>) -> Result<Self> {
-        let mut entries = Vec::new();
+        let mut frames = Vec::new();
         for (scene, dir) in recordings(dir.as_ref(), ["color", "depth"])? {
             let mut truths = list(&dir.join("depth"), &["png"])?;
             let mut pictures = list_some(&dir.join("color"), &PICTURES)?;
@@ -42,11 +42,11 @@ impl ScanNetDataset {
             for (frame, rgb) in pictures {
                 let gt = take(&mut truths, &frame);
                 let gt = gt.ok_or_else(|| unpaired(&rgb, "depth", format!("depth/{frame}.png")))?;
-                entries.push(Entry { name: frame_name(&scene, &frame), rgb, gt });
+                frames.push(Frame { name: frame_name(&scene, &frame), files: Files { rgb, gt } });
             }
             all_taken(truths, |name| format!("color/{name}.jpg"))?;
         }
-        Ok(Self { entries })
+        Ok(Self { frames })
     }
 }
 
@@ -55,21 +55,15 @@ fn number(name: &str) -> (Option<u64>, &str) {
     (name.parse().ok(), name)
 }
 
-impl Dataset for ScanNetDataset {
-    fn len(&self) -> usize {
-        self.entries.len()
+impl Loader for ScanNetDataset {
+    type Files = Files;
+
+    fn frames(&self) -> &[Frame<Files>] {
+        &self.frames
     }
 
-    fn name(&self, index: usize) -> String {
-        self.entries.get(index).map(|e| e.name.clone()).unwrap_or_default()
-    }
-
-    fn has_measurements(&self, _: usize) -> bool {
-        false
-    }
-
-    fn load(&self, index: usize) -> Result<Sample> {
-        let Entry { name, rgb: rgb_path, gt } = entry(&self.entries, index)?;
+    fn read(&self, frame: &Frame<Files>, _: usize) -> Result<Sample> {
+        let Files { rgb: rgb_path, gt } = &frame.files;
         let depth = SparseDepth::read(gt, Some(DepthScale::millimetres())).map_err(|e| naming(gt, e))?;
         let depth = some_valid(gt, depth)?;
         let mut rgb = picture(rgb_path)?;
@@ -82,6 +76,12 @@ impl Dataset for ScanNetDataset {
         if (rgb_w, rgb_h) != (w, h) {
             rgb = bicubic(&rgb, w, h);
         }
-        Ok(Sample { name: name.clone(), rgb, gt: depth.as_slice().to_vec(), sparse: None, masks: Vec::new() })
+        Ok(Sample {
+            name: frame.name.clone(),
+            rgb,
+            gt: depth.as_slice().to_vec(),
+            sparse: None,
+            masks: Vec::new(),
+        })
     }
 }
