@@ -30,8 +30,8 @@ pub struct Table {
     pub points: usize,
     /// Frames scored.
     pub frames: usize,
-    /// Names of frames that could not be scored.
-    pub skipped: Vec<String>,
+    /// Frames that could not be scored, in no mean and in no count.
+    pub skipped: Vec<Skipped>,
     /// Mean number of measured pixels.
     pub measured: f64,
     /// Frames whose measurements came with the data set, whatever `points` says.
@@ -39,6 +39,13 @@ pub struct Table {
     /// The method that `mae_ratio` compares with.
     pub reference: String,
     pub methods: Vec<MethodTable>,
+}
+
+/// A frame without scores.
+#[derive(Clone, Debug, Serialize)]
+pub struct Skipped {
+    pub frame: String,
+    pub reason: String,
 }
 
 /// One method: means over frames with 95 % confidence intervals.
@@ -165,7 +172,7 @@ struct Values {
 #[derive(Default)]
 struct Sums {
     frames: usize,
-    skipped: Vec<String>,
+    skipped: Vec<Skipped>,
     measured: usize,
     own: usize,
     methods: Vec<Values>,
@@ -173,8 +180,8 @@ struct Sums {
 
 impl Sums {
     fn add(&mut self, record: Record) {
-        if record.skipped.is_some() {
-            self.skipped.push(record.name);
+        if let Some(reason) = record.skipped {
+            self.skipped.push(Skipped { frame: record.name, reason });
             return;
         }
         self.frames += 1;

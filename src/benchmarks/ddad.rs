@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use super::files::{all_taken, depth, first_with, list, list_some, picture, some_valid, take, unpaired};
+use super::files::{all_taken, depth, first_with, list, list_some, picture, take, unpaired};
 use super::listing::{Frame, Loader};
 use super::outliers::{THRESHOLD, WINDOW, remove_outliers};
 use super::{Sample, frame_seed};
@@ -68,16 +68,15 @@ impl Loader for DdadDataset {
     }
 
     fn read(&self, frame: &Frame<Files>, index: usize) -> Result<Sample> {
-        let Files { rgb, gt: gt_path, hints } = &frame.files;
+        let Files { rgb, gt, hints } = &frame.files;
         let scale = Some(DepthScale::kitti());
         let rgb = picture(rgb)?;
-        let gt = depth(gt_path, scale, &rgb)?;
+        let gt = depth(gt, scale, &rgb)?;
         let chosen = match hints {
             Some(path) => depth(path, scale, &rgb)?,
             None => a_fifth(&gt, frame_seed(self.seed, index))?,
         };
-        let kept = remove_outliers(&chosen, WINDOW, THRESHOLD)?;
-        let sparse = some_valid(hints.as_ref().unwrap_or(gt_path), kept)?;
+        let sparse = remove_outliers(&chosen, WINDOW, THRESHOLD)?;
         Ok(Sample {
             name: frame.name.clone(),
             rgb,
@@ -89,5 +88,8 @@ impl Loader for DdadDataset {
 }
 
 fn a_fifth(gt: &SparseDepth, seed: u64) -> Result<SparseDepth> {
+    if gt.measured() == 0 {
+        return Ok(gt.clone());
+    }
     sample_points(gt.as_slice(), gt.width(), gt.height(), gt.measured().div_ceil(5), seed)
 }

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use image::{Rgb, RgbImage};
 
-use super::files::{lines, list_some, naming, some_valid};
+use super::files::{lines, list_some, naming};
 use super::listing::{Frame, Loader};
 use super::mat::Record;
 use super::{Mask, Sample};
@@ -103,8 +103,7 @@ impl Loader for IbimsDataset {
             masks.iter().filter(named).any(|m| m.pixels[i])
         };
         let gt = depth.iter().enumerate().map(|(i, &d)| if excluded(i) { f32::NAN } else { d as f32 });
-        let gt = SparseDepth::new(w, h, gt.collect()).map_err(|e| naming(path, e))?;
-        let gt = some_valid(path, gt)?.as_slice().to_vec();
+        let gt = SparseDepth::new(w, h, gt.collect()).map_err(|e| naming(path, e))?.as_slice().to_vec();
         Ok(Sample { name: frame.name.clone(), rgb, gt, sparse: None, masks })
     }
 }

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use super::Sample;
-use super::files::{all_taken, depth, first_with, list, list_some, picture, some_valid, take, unpaired};
+use super::files::{all_taken, depth, first_with, list, list_some, picture, take, unpaired};
 use super::listing::{Frame, Loader};
 use super::outliers::{THRESHOLD, WINDOW, remove_outliers};
 use crate::depth::DepthScale;
@@ -70,7 +70,6 @@ impl Loader for KittiDataset {
         let rgb = picture(rgb)?;
         let gt = depth(gt, scale, &rgb)?.as_slice().to_vec();
         let measured = remove_outliers(&depth(sparse, scale, &rgb)?, WINDOW, THRESHOLD)?;
-        let measured = some_valid(sparse, measured)?;
         Ok(Sample { name: frame.name.clone(), rgb, gt, sparse: Some(measured), masks: Vec::new() })
     }
 }

@@ -61,9 +61,12 @@ pub trait Dataset: Send + Sync {
 
     /// Reads a frame. The same index always gives the same sample.
     ///
+    /// A frame without a single valid depth is no error, since sensors deliver such frames: [`Sample::gt`] is then NaN
+    /// everywhere, or [`Sample::sparse`] has no measurement, and the caller decides what becomes of it.
+    ///
     /// # Errors
-    /// [`Error::Argument`] beyond the last frame; otherwise an error that names the file which cannot be read, has another
-    /// format or size than it should, or holds no valid depth.
+    /// [`Error::Argument`] beyond the last frame; otherwise an error that names the file which cannot be read, or has another
+    /// format or size than it should.
     fn load(&self, index: usize) -> Result<Sample>;
 }
 
@@ -77,7 +80,7 @@ pub struct Sample {
     /// Ground-truth Z-depth, metres, row-major, as many values as `rgb` has pixels; NaN where unknown.
     pub gt: Vec<f32>,
     /// The measurements of a sensor, or the points that the benchmark's authors published, where the data set has them, after
-    /// its outlier rule; for [`DdadDataset`] without hints those that stand in for them.
+    /// its outlier rule; for [`DdadDataset`] without hints those that stand in for them. Perhaps not a single one.
     pub sparse: Option<SparseDepth>,
     /// Regions that the data set marks; empty for most.
     pub masks: Vec<Mask>,
@@ -93,12 +96,13 @@ pub struct Mask {
 }
 
 impl Sample {
-    /// The frame's own measurements; without any, `points` pixels of the ground truth drawn in a pattern.
+    /// The frame's own measurements (perhaps none, see [`Dataset::load`]); where it brings none, `points` pixels of the ground
+    /// truth drawn in a pattern.
     ///
     /// The draw depends on the seed alone (ChaCha8); give each frame its own, as [`frame_seed`] does.
     ///
     /// # Errors
-    /// As [`SparsePattern::sample`].
+    /// As [`SparsePattern::sample`]: ground truth without a valid pixel is [`Error::NoMeasurement`].
     pub fn measurements(&self, points: usize, pattern: SparsePattern, seed: u64) -> Result<SparseDepth> {
         if let Some(sparse) = &self.sparse {
             return Ok(sparse.clone());

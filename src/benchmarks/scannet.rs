@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use super::Sample;
 use super::files::{
-    PICTURES, all_taken, frame_name, list, list_some, naming, picture, recordings, some_valid, take, unpaired,
+    PICTURES, all_taken, frame_name, list, list_some, naming, picture, recordings, take, unpaired,
 };
 use super::listing::{Frame, Loader};
 use crate::depth::{DepthScale, SparseDepth};
@@ -65,7 +65,6 @@ impl Loader for ScanNetDataset {
     fn read(&self, frame: &Frame<Files>, _: usize) -> Result<Sample> {
         let Files { rgb: rgb_path, gt } = &frame.files;
         let depth = SparseDepth::read(gt, Some(DepthScale::millimetres())).map_err(|e| naming(gt, e))?;
-        let depth = some_valid(gt, depth)?;
         let mut rgb = picture(rgb_path)?;
         let (w, h) = (depth.width(), depth.height());
         let (rgb_w, rgb_h) = (rgb.width() as usize, rgb.height() as usize);

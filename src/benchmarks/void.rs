@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use image::RgbImage;
 
 use super::Sample;
-use super::files::{below, depth, frame_name, lines, naming, picture, same_size, some_valid};
+use super::files::{below, depth, frame_name, lines, naming, picture, same_size};
 use super::listing::{Frame, Loader};
 use crate::depth::{DepthScale, SparseDepth, png16};
 use crate::error::{Error, Result};
@@ -111,5 +111,5 @@ fn valid_only(sparse: &SparseDepth, path: &Path, rgb: &RgbImage) -> Result<Spars
     same_size(path, (w, h), rgb)?;
     let keep = |(&depth, &valid): (&f32, &u16)| if valid == 0 { f32::NAN } else { depth };
     let kept = sparse.as_slice().iter().zip(&validity).map(keep).collect();
-    some_valid(path, SparseDepth::new(w, h, kept)?)
+    SparseDepth::new(w, h, kept)
 }

@@ -6,6 +6,7 @@ mod common;
 mod copies;
 mod running;
 mod scores;
+mod skipped;
 
 use common::program;
 use std::fs;

@@ -42,20 +42,6 @@ fn a_checkpoint_and_all_baselines_are_scored() {
 }
 
 #[test]
-fn frames_that_cannot_be_scored_are_named() {
-    let folder = Folder::new(3);
-    // Where the ground truth was the input, nothing is left to predict.
-    let truth = fs::read_dir(folder.path("data/gt")).unwrap().map(|e| e.unwrap().path()).min().unwrap();
-    fs::create_dir(folder.path("data/sparse")).unwrap();
-    fs::copy(&truth, folder.path("data/sparse").join(truth.file_name().unwrap())).unwrap();
-    let out = succeeded(folder.classical("a", &["--json"]));
-    let v: Value = serde_json::from_slice(&out.stdout).unwrap();
-    assert_eq!(v["tables"][0]["frames"], 2);
-    assert_eq!(v["tables"][0]["skipped"][0], truth.file_stem().unwrap().to_str().unwrap());
-    assert!(said(&out).contains("skipped"));
-}
-
-#[test]
 fn measured_pixels_count_if_asked() {
     let folder = Folder::new(2);
     let report = |out: &str, more: &[&str]| -> (Value, String) {

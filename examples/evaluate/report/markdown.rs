@@ -2,7 +2,7 @@
 
 use crate::Score;
 
-use super::{MethodTable, Table, Tables};
+use super::{MethodTable, Skipped, Table, Tables};
 use sdim::depth::metrics::{Interval, METRICS, Metric};
 use std::fmt::Write;
 
@@ -40,13 +40,7 @@ fn table(text: &mut String, t: &Table) {
     };
     let _ =
         writeln!(text, "\n## {title}\n\n{} frames, {:.0} measured pixels in the mean.", t.frames, t.measured);
-    if !t.skipped.is_empty() {
-        let _ = writeln!(
-            text,
-            "\nNot scored, for want of ground truth or measurements: {}.",
-            t.skipped.join(", ")
-        );
-    }
+    skipped(text, t);
     if t.methods.is_empty() {
         return;
     }
@@ -72,6 +66,21 @@ fn table(text: &mut String, t: &Table) {
             let values: Vec<String> = names.iter().map(|n| digits(m.confidence.get(*n).copied())).collect();
             let _ = writeln!(text, "| {} | {} |", m.name, values.join(" | "));
         }
+    }
+}
+
+/// Frames by the reason for which they were left out.
+fn skipped(text: &mut String, t: &Table) {
+    let mut reasons: Vec<(&str, Vec<&str>)> = Vec::new();
+    for Skipped { frame, reason } in &t.skipped {
+        match reasons.iter_mut().find(|(known, _)| known == reason) {
+            Some((_, frames)) => frames.push(frame),
+            None => reasons.push((reason, vec![frame])),
+        }
+    }
+    for (reason, frames) in reasons {
+        let (n, of) = (frames.len(), t.frames + t.skipped.len());
+        let _ = writeln!(text, "\nSkipped, {n} of {of} frames, {reason}: {}.", frames.join(", "));
     }
 }
 
