@@ -9,7 +9,7 @@ use super::files::{
 use super::listing::{Frame, Loader};
 use crate::depth::{DepthScale, SparseDepth};
 use crate::error::{Error, Result};
-use crate::vlm::resize::bicubic;
+use crate::vlm::resize::lanczos;
 
 #[derive(Clone, Debug)]
 pub(super) struct Files {
@@ -20,9 +20,12 @@ pub(super) struct Files {
 /// One scene, or a folder of scenes, each with `color/NUMBER.jpg` and `depth/NUMBER.png`.
 ///
 /// Depth is stored in 16 bits, in millimetres, 0 = none. Colour is larger than depth (1296 x 968 and 640 x 480): the picture is
-/// resized to the depth map's size, as Marigold-DC does on ScanNet, here with Pillow's default bicubic filter; depth is never
-/// resampled, so that no value is invented. A picture whose sides are in another ratio (more than 2 %) is an error. Frames are
-/// in order of their numbers and have no measurements of their own.
+/// resized to the depth map's size by Lanczos' filter, as Marigold-DC prepares ScanNet with Pillow, here exact to the bit of Pillow
+/// 12; depth is never resampled, so that no value is invented. A picture whose sides are in another ratio (more than 2 %) is an
+/// error. Frames are in order of their numbers and have no measurements of their own.
+///
+/// Evaluations take a choice of the frames: Marigold-DC the 745 of `scannet_decotr_split.txt` in its repository, a list as
+/// [`super::LayoutOptions::frames`] takes it.
 #[derive(Clone, Debug)]
 pub struct ScanNetDataset {
     frames: Vec<Frame<Files>>,
@@ -73,7 +76,7 @@ impl Loader for ScanNetDataset {
             return Err(Error::format(rgb_path, format!("{rgb_w}x{rgb_h} pixels"), expected));
         }
         if (rgb_w, rgb_h) != (w, h) {
-            rgb = bicubic(&rgb, w, h);
+            rgb = lanczos(&rgb, w, h);
         }
         Ok(Sample {
             name: frame.name.clone(),

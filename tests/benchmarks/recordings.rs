@@ -2,7 +2,9 @@
 
 use std::fs;
 
+use image::{Rgb, RgbImage};
 use sdim::benchmarks::Layout;
+use sdim::vlm::resize::{bicubic, lanczos};
 
 use crate::copies::{H, W, depth, grey8, picture_of, scannet, tum};
 use crate::{all, damage, open, says, without_depth};
@@ -51,6 +53,20 @@ fn scannet_resizes_the_picture_only() {
     assert_eq!(samples[1].rgb.dimensions(), (W as u32, H as u32));
     assert!(samples[1].rgb[(5, 5)][0].abs_diff(102) <= 2);
     assert_eq!((samples[1].gt[W + 7], samples[1].gt[0].is_nan()), (1.507, true));
+}
+
+#[test]
+fn scannet_resizes_by_lanczos_filter() {
+    let dir = tempfile::tempdir().unwrap();
+    scannet(dir.path());
+    let stripes = RgbImage::from_fn(2 * W as u32, 2 * H as u32, |x, y| {
+        Rgb([[0, 255][(x / 3 % 2) as usize], 9 * y as u8, 70])
+    });
+    fs::remove_file(dir.path().join("color/0.jpg")).unwrap();
+    stripes.save(dir.path().join("color/0.png")).unwrap();
+    let rgb = all(Layout::ScanNet, dir.path()).unwrap().remove(0).rgb;
+    assert_eq!(rgb, lanczos(&stripes, W, H));
+    assert_ne!(rgb, bicubic(&stripes, W, H));
 }
 
 #[test]
