@@ -20,11 +20,12 @@ mod lzf;
 mod mat;
 mod nyu;
 pub mod outliers;
+mod parts;
 mod scannet;
 mod tum;
 mod void;
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 use image::RgbImage;
@@ -39,6 +40,7 @@ pub use folder::{DepthFile, FolderDataset, write_frame};
 pub use ibims::IbimsDataset;
 pub use kitti::KittiDataset;
 pub use nyu::NyuDataset;
+use parts::{Chosen, Ranged};
 pub use scannet::ScanNetDataset;
 pub use tum::TumDataset;
 pub use void::VoidDataset;
@@ -147,7 +149,7 @@ pub enum Layout {
 }
 
 /// What may be chosen when a data set is opened.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct LayoutOptions {
     /// Unit of the integer files of [`Layout::Folder`]. The other layouts have a unit of their own and refuse another.
     pub scale: Option<DepthScale>,
@@ -157,6 +159,10 @@ pub struct LayoutOptions {
     /// Marigold-DC scores. Measurements that the data set brings are never touched; points drawn from the ground truth lie in the
     /// range as it does.
     pub range: Option<(f32, f32)>,
+    /// A text file that names the frames to take, one per line and in its order; `#` starts a comment. A name is that of
+    /// [`Dataset::name`], or `SCENE/NUMBER` as in the published lists of ScanNet's frames, with or without zeros before the
+    /// number. `None`: all frames.
+    pub frames: Option<PathBuf>,
 }
 
 impl Layout {
@@ -214,14 +220,15 @@ impl Layout {
     ///
     /// # Errors
     /// [`Error::Argument`] for an option that the layout does not take and for a range that is empty; otherwise an error that
-    /// names the file or directory which is missing, or has no partner.
+    /// names the file or directory which is missing, or has no partner, or the list of frames with the name that is unknown or
+    /// stands in it twice.
     pub fn open(self, path: impl AsRef<Path>, options: &LayoutOptions) -> Result<Box<dyn Dataset>> {
         let path = path.as_ref();
         if let (Some(scale), true) = (options.scale, self != Layout::Folder) {
             let expected = format!("none: the files of layout {} have a fixed unit", self.name());
             return Err(Error::argument("depth scale", scale.units(), expected));
         }
-        let frames: Box<dyn Dataset> = match self {
+        let mut frames: Box<dyn Dataset> = match self {
             Layout::Folder => Box::new(FolderDataset::open(path, options.scale)?),
             Layout::Nyu => Box::new(NyuDataset::open(path)?),
             Layout::Void => Box::new(VoidDataset::open(path)?),
@@ -231,13 +238,13 @@ impl Layout {
             Layout::Tum => Box::new(TumDataset::open(path)?),
             Layout::ScanNet => Box::new(ScanNetDataset::open(path)?),
         };
-        match options.range {
-            None => Ok(frames),
-            Some((near, far)) if near < far => Ok(Box::new(Ranged { frames, near, far })),
-            Some((near, far)) => {
-                Err(Error::argument("range", format!("{near} to {far} m"), "the nearer depth first"))
-            }
+        if let Some(list) = &options.frames {
+            frames = Box::new(Chosen::by_list(frames, list)?);
         }
+        if let Some(range) = options.range {
+            frames = Box::new(Ranged::new(frames, range)?);
+        }
+        Ok(frames)
     }
 }
 
@@ -254,36 +261,5 @@ impl FromStr for Layout {
 impl std::fmt::Display for Layout {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.write_str(self.name())
-    }
-}
-
-/// A data set whose ground truth counts only between two depths.
-struct Ranged {
-    frames: Box<dyn Dataset>,
-    near: f32,
-    far: f32,
-}
-
-impl Dataset for Ranged {
-    fn len(&self) -> usize {
-        self.frames.len()
-    }
-
-    fn name(&self, index: usize) -> String {
-        self.frames.name(index)
-    }
-
-    fn has_measurements(&self, index: usize) -> bool {
-        self.frames.has_measurements(index)
-    }
-
-    fn load(&self, index: usize) -> Result<Sample> {
-        let mut sample = self.frames.load(index)?;
-        for depth in &mut sample.gt {
-            if !(self.near..=self.far).contains(depth) {
-                *depth = f32::NAN;
-            }
-        }
-        Ok(sample)
     }
 }
