@@ -59,13 +59,22 @@ fn results_of_other_settings_are_not_mixed() {
     let folder = Folder::new(2);
     succeeded(folder.classical("a", &[]));
     let before = results(&folder.path("a"));
-    let cases: [(&[&str], &str); 6] = [
+    // The same frames the other way round get other points.
+    let names = fs::read_dir(folder.path("data/gt")).unwrap().map(|e| e.unwrap().path());
+    let mut names: Vec<String> =
+        names.map(|p| p.file_stem().unwrap().to_str().unwrap().to_string()).collect();
+    names.sort();
+    names.reverse();
+    let turned = folder.path("turned.txt");
+    fs::write(&turned, names.join("\n")).unwrap();
+    let cases: [(&[&str], &str); 7] = [
         (&["--seed", "3"], "`seed`"),
         (&["--score", "all"], "`score`"),
         (&["--resample"], "`resample`"),
         (&["--pattern", "sfm"], "`pattern`"),
         (&["--limit", "1"], "`frames`"),
         (&["--range", "1,5"], "`range`"),
+        (&["--frame-list", text(&turned)], "`names`"),
     ];
     for (more, named) in cases {
         let out = folder.classical("a", more);
@@ -97,7 +106,10 @@ fn figures_are_drawn_once() {
 fn bad_arguments_are_named_and_nothing_is_written() {
     let folder = Folder::new(1);
     let out = folder.path("out");
-    let cases: [(&[&str], &str); 15] = [
+    let list = folder.path("list.txt");
+    fs::write(&list, "scene0707_00/343").unwrap();
+    let cases: [(&[&str], &str); 16] = [
+        (&["--frame-list", text(&list)], "\"scene0707_00/343\", no such frame"),
         (&["--score", "some"], "unseen, all"),
         (&["--layout", "cityscapes"], "cityscapes"),
         (&["--points", "0"], "--points 0"),
@@ -121,11 +133,12 @@ fn bad_arguments_are_named_and_nothing_is_written() {
     }
     let evaluate = |args: &[&str]| Command::new(program("evaluate")).args(args).output().unwrap();
     let absent = folder.path("absent");
-    let alone: [(&[&str], &str); 7] = [
+    let alone: [(&[&str], &str); 8] = [
         // What would change nothing is not taken without a word.
         (&["--merge", "a", "--score", "all"], "--score"),
         (&["--merge", "a", "--points", "100"], "--points"),
         (&["--procedural", "2", "--range", "1,5"], "--range"),
+        (&["--procedural", "2", "--frame-list", "list.txt"], "--frame-list"),
         (&[], "--data"),
         (&["--data", text(&absent)], "absent"),
         (&["--merge", text(&absent)], "absent"),

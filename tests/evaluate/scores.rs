@@ -1,7 +1,7 @@
 //! What is scored and what the reports say.
 
 use crate::{Folder, benchmark, copies, said, succeeded, text};
-use serde_json::Value;
+use serde_json::{Value, json};
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Output;
@@ -93,7 +93,78 @@ fn measured_pixels_count_if_asked() {
         (&2.into(), &2.into(), &0.into())
     );
     assert_eq!(v["tables"][0]["methods"][0]["metrics"]["mae"]["value"], 0.0);
+    // Without linear the first method stands in for it; without any error there is no ratio.
+    assert_eq!(v["tables"][0]["reference"], "sdim-tiny");
+    let expected = json!({"geometric_mean": null, "better": 0, "frames": 2, "without_ratio": 2});
+    assert_eq!(v["tables"][0]["methods"][1]["relative"]["mae"], expected);
     assert!(v["tables"][0]["methods"][0]["regions"].as_array().unwrap().is_empty());
+}
+
+#[test]
+fn errors_are_compared_frame_by_frame() {
+    let folder = Folder::new(5);
+    let out = succeeded(folder.classical("a", &["--json"]));
+    let v: Value = serde_json::from_slice(&out.stdout).unwrap();
+    let csv = fs::read_to_string(folder.path("a/frames.csv")).unwrap();
+    let heads: Vec<&str> = csv.lines().next().unwrap().split(',').collect();
+    let markdown = fs::read_to_string(folder.path("a/report.md")).unwrap();
+    let mut cells = Vec::new();
+    for (table, points) in v["tables"].as_array().unwrap().iter().zip(["30", "60"]) {
+        assert_eq!(table["reference"], "linear");
+        let [nearest, linear] = [&table["methods"][0], &table["methods"][1]];
+        for key in ["mae", "rmse", "abs_rel", "gradient_error"] {
+            let column = heads.iter().position(|h| *h == key).unwrap();
+            let of = |method: &str| -> Vec<f64> {
+                let rows = csv.lines().map(|l| l.split(',').collect::<Vec<_>>());
+                rows.filter(|r| r[0] == points && r[2] == method)
+                    .map(|r| r[column].parse().unwrap())
+                    .collect()
+            };
+            let ratios: Vec<f64> = of("nearest").iter().zip(of("linear")).map(|(e, r)| e / r).collect();
+            assert_eq!(ratios.len(), 5);
+            let found = &nearest["relative"][key];
+            let of = |end: &str| found["geometric_mean"][end].as_f64().unwrap();
+            let expected = ratios.iter().product::<f64>().powf(0.2);
+            assert!((of("value") / expected - 1.0).abs() < 1e-9, "{key}: {found} {expected}");
+            assert!(
+                of("low") <= of("value") && of("value") <= of("high") && of("low") < of("high"),
+                "{key}: {found}"
+            );
+            let better = ratios.iter().filter(|r| **r < 1.0).count();
+            assert_eq!((&found["better"], &found["frames"]), (&better.into(), &5.into()), "{key}");
+            assert_eq!(found["without_ratio"], 0);
+            cells.push(format!("{expected:.3} ("));
+            cells.push(format!("), {better} of 5 |"));
+            let own = &linear["relative"][key];
+            assert_eq!((&own["geometric_mean"]["value"], &own["better"]), (&1.0.into(), &0.into()), "{key}");
+        }
+    }
+    // One row per table, cell by cell.
+    let rows: Vec<&str> =
+        markdown.lines().filter(|l| l.starts_with("| nearest |") && l.contains(" of 5 |")).collect();
+    assert_eq!(rows.len(), 2, "{markdown}");
+    let mut rest = rows.concat();
+    for cell in cells {
+        let at = rest.find(&cell).unwrap_or_else(|| panic!("{cell} in {rest}"));
+        rest.drain(..at);
+    }
+    assert!(
+        markdown.contains("| method | MAE : linear | RMSE : linear | AbsRel : linear | GE : linear |"),
+        "{markdown}"
+    );
+    // Linear's own row says nothing, and the means in metres stay.
+    assert!(
+        markdown.contains("| linear |  |  |  |  |") && markdown.contains("| method | MAE m |"),
+        "{markdown}"
+    );
+    assert!(!markdown.contains("was not run"));
+
+    let out = succeeded(folder.evaluate(&["--points", "30", "--methods", "nearest,inverse-distance"]));
+    let markdown = String::from_utf8(out.stdout).unwrap();
+    assert!(
+        markdown.contains("`nearest`, since `linear` was not run") && markdown.contains("| MAE : nearest |"),
+        "{markdown}"
+    );
 }
 
 #[test]
