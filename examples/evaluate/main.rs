@@ -3,8 +3,10 @@
 //! `cargo run --release --example evaluate -- --layout folder --data DIR --points 100,500 --out RESULTS`
 //!
 //! Errors are over ground-truth pixels that were not given as input; the tables of Marigold-DC, and those compared with them, count
-//! all of them: `--score all`. Each frame's scores are one small file under `--out`, so a run that was stopped goes on where it was,
-//! and `--shard I/N` spreads a data set over machines; `--merge` makes one report of them.
+//! all of them: `--score all`. Beside the means in metres stand geometric means over frames of each error by that of `linear` on
+//! the same frame, which the frames with far depth do not rule. A frame without valid depth is skipped and named in the report; a
+//! file that cannot be read ends the run with its name. Each frame's scores are one small file under `--out`, so a run that was
+//! stopped goes on where it was, and `--shard I/N` spreads a data set over machines; `--merge` makes one report of them.
 //! report.md, report.json and frames.csv depend on the scores alone and are the same, byte for byte, however the work was divided;
 //! times and memory stand in speed.json and are printed to stderr.
 //!
