@@ -6,7 +6,7 @@ mod common;
 
 use common::random::mix;
 use image::RgbImage;
-use sdim::image::resize::bicubic;
+use sdim::image::resize::{bicubic, lanczos};
 use sdim::vlm::qwen2_5::preprocess::PreprocessorConfig;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
@@ -36,14 +36,20 @@ fn picture(width: usize, height: usize) -> RgbImage {
 }
 
 #[test]
-fn the_resize_gives_the_bytes_of_pillow() {
+fn resizes_give_the_bytes_of_pillow() {
     let cases = rows("resize.json");
     assert!(cases.len() > 200);
     for case in cases {
-        let [w, h, new_w, new_h, wanted]: [usize; 5] = serde_json::from_value(case).unwrap();
-        let resized = bicubic(&picture(w, h), new_w, new_h);
-        assert_eq!(resized.dimensions(), (new_w as u32, new_h as u32));
-        assert_eq!(crc32fast::hash(&resized) as usize, wanted, "{w}x{h} to {new_w}x{new_h}");
+        let [w, h, new_w, new_h, by_cubic, by_lanczos]: [usize; 6] = serde_json::from_value(case).unwrap();
+        let image = picture(w, h);
+        for (name, resize, wanted) in [
+            ("bicubic", bicubic as fn(&RgbImage, usize, usize) -> RgbImage, by_cubic),
+            ("lanczos", lanczos, by_lanczos),
+        ] {
+            let resized = resize(&image, new_w, new_h);
+            assert_eq!(resized.dimensions(), (new_w as u32, new_h as u32));
+            assert_eq!(crc32fast::hash(&resized) as usize, wanted, "{name}, {w}x{h} to {new_w}x{new_h}");
+        }
     }
 }
 

@@ -3,8 +3,10 @@
 //! `cargo run --release --example evaluate -- --layout folder --data DIR --points 100,500 --out RESULTS`
 //!
 //! Errors are over ground-truth pixels that were not given as input; the tables of Marigold-DC, and those compared with them, count
-//! all of them: `--score all`. Each frame's scores are one small file under `--out`, so a run that was stopped goes on where it was,
-//! and `--shard I/N` spreads a data set over machines; `--merge` makes one report of them.
+//! all of them: `--score all`. Beside the means in metres stand geometric means over frames of each error by that of `linear` on
+//! the same frame, which the frames with far depth do not rule. A frame without valid depth is skipped and named in the report; a
+//! file that cannot be read ends the run with its name. Each frame's scores are one small file under `--out`, so a run that was
+//! stopped goes on where it was, and `--shard I/N` spreads a data set over machines; `--merge` makes one report of them.
 //! report.md, report.json and frames.csv depend on the scores alone and are the same, byte for byte, however the work was divided;
 //! times and memory stand in speed.json and are printed to stderr.
 //!
@@ -64,7 +66,7 @@ pub struct Args {
     #[arg(long, required_unless_present_any = ["procedural", "merge"])]
     data: Option<PathBuf>,
     /// Score on this many held-out procedural scenes of 320x240 instead.
-    #[arg(long, conflicts_with_all = ["data", "layout", "depth_scale", "range", "resample"])]
+    #[arg(long, conflicts_with_all = ["data", "layout", "depth_scale", "range", "frame_list", "resample"])]
     procedural: Option<usize>,
     /// Unit of integer depth files of layout folder: mm, kitti, tum or units per metre.
     #[arg(long)]
@@ -72,6 +74,10 @@ pub struct Args {
     /// Nearest and farthest ground truth that counts, metres: NEAR,FAR.
     #[arg(long, value_parser = pair)]
     range: Option<(f32, f32)>,
+    /// Only the frames that this text file names, one per line, in its order: as the report calls them, or SCENE/NUMBER as in the
+    /// published lists of ScanNet's frames.
+    #[arg(long, value_name = "FILE")]
+    frame_list: Option<PathBuf>,
     /// Points drawn from the ground truth where a frame has no measurements of its own; several: 100,500,1500. Default: what
     /// the benchmark's protocol says, else 500. An error where all frames have their own (void, kitti, ddad, nyu with its hints).
     #[arg(long, value_delimiter = ',')]
@@ -119,7 +125,7 @@ pub struct Args {
     shard: Option<Shard>,
     /// Make the report of finished runs or shards instead of running; into --out if given.
     #[arg(long, num_args = 1.., value_name = "DIR", conflicts_with_all = [
-        "data", "procedural", "layout", "depth_scale", "range", "points", "pattern", "resample", "score", "seed", "limit",
+        "data", "procedural", "layout", "depth_scale", "range", "frame_list", "points", "pattern", "resample", "score", "seed", "limit",
         "checkpoint", "adapter", "methods", "plan", "weights", "device", "shard", "figures", "verbose"])]
     merge: Vec<PathBuf>,
     /// Draw the first frames into this folder, all methods and their errors beside each other.

@@ -21,7 +21,8 @@ pub struct Record {
     pub measured: usize,
     /// Whether they came with the data set and were not drawn.
     pub own: bool,
-    /// Why the frame cannot be scored, if it cannot; there are no scores then.
+    /// Why the frame cannot be scored, if it cannot for want of valid depth; there are no scores then. A file that cannot be
+    /// read is an error instead: it is mended or fetched again, while means over what is left would pass for those of the whole set.
     pub skipped: Option<String>,
     /// By method, in the order of the table.
     pub scores: Vec<Scores>,

@@ -5,16 +5,24 @@ use crate::record::{self, Named, Record, read_json, write_json, write_whole};
 use crate::settings::Settings;
 use crate::speed::Speed;
 use anyhow::{Context, ensure};
-use sdim::metrics::{Interval, METRICS, bootstrap_mean, bootstrap_ratio};
+use sdim::metrics::{Interval, METRICS, RelativeError, bootstrap_mean, bootstrap_ratio};
 use serde::Serialize;
 use std::fmt::Write as _;
 use std::io::Write as _;
+use std::iter::zip;
 use std::path::{Path, PathBuf};
 
 mod markdown;
 
 /// Seed of the bootstrap; the same for all, so that methods are compared on the same draws.
 const SEED: u64 = 0;
+
+/// The method that others are compared with, where it is among them.
+const REFERENCE: &str = "linear";
+
+/// Errors that are compared frame by frame: their names in files, and in tables.
+const RELATIVE: [(&str, &str); 4] =
+    [("mae", "MAE"), ("rmse", "RMSE"), ("abs_rel", "AbsRel"), ("gradient_error", "GE")];
 
 /// What was found, by number of points.
 #[derive(Debug, Serialize)]
@@ -30,15 +38,22 @@ pub struct Table {
     pub points: usize,
     /// Frames scored.
     pub frames: usize,
-    /// Names of frames that could not be scored.
-    pub skipped: Vec<String>,
+    /// Frames that could not be scored, in no mean and in no count.
+    pub skipped: Vec<Skipped>,
     /// Mean number of measured pixels.
     pub measured: f64,
     /// Frames whose measurements came with the data set, whatever `points` says.
     pub own: usize,
-    /// The method that `mae_ratio` compares with.
+    /// The method that `mae_ratio` and `relative` compare with: `linear`, or the first of the table where that was not run.
     pub reference: String,
     pub methods: Vec<MethodTable>,
+}
+
+/// A frame without scores.
+#[derive(Clone, Debug, Serialize)]
+pub struct Skipped {
+    pub frame: String,
+    pub reason: String,
 }
 
 /// One method: means over frames with 95 % confidence intervals.
@@ -49,6 +64,8 @@ pub struct MethodTable {
     pub gradient_error: Option<Interval>,
     /// Mean MAE over that of the reference, frames drawn in pairs.
     pub mae_ratio: Option<Interval>,
+    /// Errors by those of the reference on the same frame: MAE, RMSE, AbsRel and gradient error.
+    pub relative: Named<RelativeError>,
     /// Pixels with truth that were left out.
     pub missing: usize,
     pub regions: Vec<RegionTable>,
@@ -156,7 +173,7 @@ fn lines(csv: &mut impl std::io::Write, points: usize, record: &Record) -> anyho
 struct Values {
     name: String,
     metrics: [Vec<f64>; METRICS.len()],
-    gradient_error: Vec<f64>,
+    gradient_error: Vec<Option<f64>>,
     missing: usize,
     regions: Vec<RegionTable>,
     confidence: Named<(f64, usize)>,
@@ -165,7 +182,7 @@ struct Values {
 #[derive(Default)]
 struct Sums {
     frames: usize,
-    skipped: Vec<String>,
+    skipped: Vec<Skipped>,
     measured: usize,
     own: usize,
     methods: Vec<Values>,
@@ -173,8 +190,8 @@ struct Sums {
 
 impl Sums {
     fn add(&mut self, record: Record) {
-        if record.skipped.is_some() {
-            self.skipped.push(record.name);
+        if let Some(reason) = record.skipped {
+            self.skipped.push(Skipped { frame: record.name, reason });
             return;
         }
         self.frames += 1;
@@ -191,7 +208,7 @@ impl Sums {
 
     fn table(&self, points: usize, settings: &Settings) -> Table {
         let named = |name: &str| self.methods.iter().find(|m| m.name == name);
-        let reference = named("linear").or(self.methods.first());
+        let reference = named(REFERENCE).or(self.methods.first());
         Table {
             points,
             frames: self.frames,
@@ -211,7 +228,7 @@ impl Values {
         for (list, metric) in self.metrics.iter_mut().zip(METRICS) {
             list.push((metric.of)(&scores.errors));
         }
-        self.gradient_error.extend(scores.gradient_error);
+        self.gradient_error.push(scores.gradient_error);
         self.missing += scores.errors.missing;
         for (name, errors) in scores.regions {
             let at = self.regions.iter().position(|r| r.name == name).unwrap_or_else(|| {
@@ -247,16 +264,33 @@ impl Values {
             let (name, mae, rmse, abs_rel) = (r.name.clone(), r.mae / n, r.rmse / n, r.abs_rel / n);
             RegionTable { name, frames: r.frames, pixels: r.pixels, mae, rmse, abs_rel }
         };
+        let gradients: Vec<f64> = self.gradient_error.iter().copied().flatten().collect();
         MethodTable {
             name: self.name.clone(),
             metrics: metrics
                 .filter_map(|(m, values)| Some((m.name.to_string(), bootstrap_mean(values, SEED)?)))
                 .collect(),
-            gradient_error: bootstrap_mean(&self.gradient_error, SEED),
+            gradient_error: bootstrap_mean(&gradients, SEED),
             mae_ratio: bootstrap_ratio(&self.metrics[0], &reference.metrics[0], SEED),
+            relative: self.relative(reference),
             missing: self.missing,
             regions: self.regions.iter().filter(|r| r.frames > 0).map(region).collect(),
             confidence: self.confidence.iter().map(|(k, (s, n))| (k.clone(), s / *n as f64)).collect(),
         }
+    }
+
+    /// Frame by frame: all methods were scored on the same frames, in the same order.
+    fn relative(&self, reference: &Values) -> Named<RelativeError> {
+        let pairs = |name: &str| -> Vec<(f64, f64)> {
+            match METRICS.iter().position(|m| m.name == name) {
+                Some(at) => zip(&self.metrics[at], &reference.metrics[at]).map(|(&e, &r)| (e, r)).collect(),
+                // The one that is no member of `Errors`.
+                None => zip(&self.gradient_error, &reference.gradient_error)
+                    .filter_map(|(e, r)| e.zip(*r))
+                    .collect(),
+            }
+        };
+        let of = |name: &str| Some((name.to_string(), RelativeError::over(&pairs(name), SEED)?));
+        RELATIVE.iter().filter_map(|(name, _)| of(name)).collect()
     }
 }

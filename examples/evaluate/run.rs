@@ -76,7 +76,8 @@ impl Task<'_> {
     fn finish(&self, out: &Path) -> anyhow::Result<Option<String>> {
         let path = record::path(out, self.points, self.index);
         let figure = self.figure().filter(|f| !f.exists());
-        if figure.is_none() && read_json::<Record>(&path)?.is_some() {
+        // A frame that was skipped has no figure and never gets one.
+        if read_json::<Record>(&path)?.is_some_and(|done| figure.is_none() || done.skipped.is_some()) {
             return Ok(None);
         }
         let name = self.frames.name(self.index);

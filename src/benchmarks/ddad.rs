@@ -2,15 +2,15 @@
 
 use std::path::{Path, PathBuf};
 
-use super::files::{all_taken, depth, first_with, list, list_some, picture, some_valid, take, unpaired};
+use super::files::{all_taken, depth, first_with, list, list_some, picture, take, unpaired};
+use super::listing::{Frame, Loader};
 use super::outliers::{THRESHOLD, WINDOW, remove_outliers};
-use super::{Dataset, Sample, entry, frame_seed};
+use super::{Sample, frame_seed};
 use crate::depth::{DepthScale, SparseDepth, sample_points};
 use crate::error::Result;
 
 #[derive(Clone, Debug)]
-struct Entry {
-    name: String,
+pub(super) struct Files {
     rgb: PathBuf,
     gt: PathBuf,
     hints: Option<PathBuf>,
@@ -25,7 +25,7 @@ struct Entry {
 /// protocol's. Either way the points go through [`remove_outliers`] as on KITTI; the ground truth does not.
 #[derive(Clone, Debug)]
 pub struct DdadDataset {
-    entries: Vec<Entry>,
+    frames: Vec<Frame<Files>>,
     seed: u64,
 }
 
@@ -39,7 +39,7 @@ impl DdadDataset {
         let hints_dir = dir.join("hints");
         let mut truths = list(&dir.join("gt"), &["png"])?;
         let mut hints = if hints_dir.is_dir() { Some(list(&hints_dir, &["png"])?) } else { None };
-        let mut entries = Vec::new();
+        let mut frames = Vec::new();
         for (name, rgb) in list_some(&dir.join("rgb"), &["png"])? {
             let lacks = |kind: &str| unpaired(&rgb, kind, format!("{kind}/{name}.png"));
             let gt = take(&mut truths, &name).ok_or_else(|| lacks("gt"))?;
@@ -47,40 +47,37 @@ impl DdadDataset {
                 Some(files) => Some(take(files, &name).ok_or_else(|| lacks("hints"))?),
                 None => None,
             };
-            entries.push(Entry { name, rgb, gt, hints });
+            frames.push(Frame { name, files: Files { rgb, gt, hints } });
         }
         truths.extend(hints.unwrap_or_default());
         all_taken(truths, |name| format!("rgb/{name}.png"))?;
-        Ok(Self { entries, seed })
+        Ok(Self { frames, seed })
     }
 }
 
-impl Dataset for DdadDataset {
-    fn len(&self) -> usize {
-        self.entries.len()
+impl Loader for DdadDataset {
+    type Files = Files;
+
+    fn frames(&self) -> &[Frame<Files>] {
+        &self.frames
     }
 
-    fn name(&self, index: usize) -> String {
-        self.entries.get(index).map(|e| e.name.clone()).unwrap_or_default()
+    fn brings_measurements(&self, _: &Files) -> bool {
+        true
     }
 
-    fn has_measurements(&self, index: usize) -> bool {
-        index < self.entries.len()
-    }
-
-    fn load(&self, index: usize) -> Result<Sample> {
-        let Entry { name, rgb, gt: gt_path, hints } = entry(&self.entries, index)?;
+    fn read(&self, frame: &Frame<Files>, index: usize) -> Result<Sample> {
+        let Files { rgb, gt, hints } = &frame.files;
         let scale = Some(DepthScale::kitti());
         let rgb = picture(rgb)?;
-        let gt = depth(gt_path, scale, &rgb)?;
+        let gt = depth(gt, scale, &rgb)?;
         let chosen = match hints {
             Some(path) => depth(path, scale, &rgb)?,
             None => a_fifth(&gt, frame_seed(self.seed, index))?,
         };
-        let kept = remove_outliers(&chosen, WINDOW, THRESHOLD)?;
-        let sparse = some_valid(hints.as_ref().unwrap_or(gt_path), kept)?;
+        let sparse = remove_outliers(&chosen, WINDOW, THRESHOLD)?;
         Ok(Sample {
-            name: name.clone(),
+            name: frame.name.clone(),
             rgb,
             gt: gt.as_slice().to_vec(),
             sparse: Some(sparse),
@@ -90,5 +87,8 @@ impl Dataset for DdadDataset {
 }
 
 fn a_fifth(gt: &SparseDepth, seed: u64) -> Result<SparseDepth> {
+    if gt.measured() == 0 {
+        return Ok(gt.clone());
+    }
     sample_points(gt.as_slice(), gt.width(), gt.height(), gt.measured().div_ceil(5), seed)
 }

@@ -120,11 +120,11 @@ pub(super) fn picture(path: &Path) -> Result<RgbImage> {
     read_rgb(path).map_err(|e| naming(path, e))
 }
 
-/// Measured depth of the picture's size; at least one pixel is valid.
+/// Depth of the picture's size, perhaps valid at no pixel.
 pub(super) fn depth(path: &Path, scale: Option<DepthScale>, rgb: &RgbImage) -> Result<SparseDepth> {
     let map = SparseDepth::read(path, scale).map_err(|e| naming(path, e))?;
     same_size(path, (map.width(), map.height()), rgb)?;
-    some_valid(path, map)
+    Ok(map)
 }
 
 /// Fails, naming the file, unless a map of this width and height has the picture's size.
@@ -134,14 +134,6 @@ pub(super) fn same_size(path: &Path, (width, height): (usize, usize), rgb: &RgbI
         return Ok(());
     }
     Err(Error::format(path, format!("{width}x{height} pixels"), format!("{w}x{h} as its picture")))
-}
-
-/// Fails, naming the file, when a map has no valid pixel.
-pub(super) fn some_valid(path: &Path, map: SparseDepth) -> Result<SparseDepth> {
-    if map.measured() > 0 {
-        return Ok(map);
-    }
-    Err(Error::format(path, "no valid depth at any pixel", "at least one depth above 0"))
 }
 
 /// Adds the file to errors that speak of values or sizes only.

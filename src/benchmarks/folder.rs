@@ -6,9 +6,10 @@ use std::path::{Path, PathBuf};
 
 use image::ImageFormat;
 
+use super::Sample;
 use super::files::{Listed, PICTURES, all_taken, depth, list, list_some, picture, take, unpaired};
 use super::flat::Flat;
-use super::{Dataset, Sample, entry};
+use super::listing::{Frame, Loader};
 use crate::depth::DepthScale;
 use crate::depth::io::{npy, png16};
 use crate::error::{Error, Result};
@@ -18,8 +19,7 @@ use crate::scenes::RgbdFrame;
 const DEPTHS: [&str; 2] = ["png", "npy"];
 
 #[derive(Clone, Debug)]
-struct Entry {
-    name: String,
+pub(super) struct Files {
     rgb: PathBuf,
     gt: PathBuf,
     sparse: Option<PathBuf>,
@@ -29,7 +29,7 @@ struct Entry {
 /// A folder of frames, in order of their names. Opening lists files, loading reads them.
 #[derive(Clone, Debug)]
 pub struct FolderDataset {
-    entries: Vec<Entry>,
+    frames: Vec<Frame<Files>>,
 }
 
 impl FolderDataset {
@@ -61,39 +61,37 @@ impl FolderDataset {
         at: impl Fn(&str, &str) -> String,
         scale: impl Fn(&str) -> Option<DepthScale>,
     ) -> Result<Self> {
-        let mut entries = Vec::with_capacity(pictures.len());
+        let mut frames = Vec::with_capacity(pictures.len());
         for (name, rgb) in pictures {
             let Some(gt) = take(&mut truths, &name) else {
                 return Err(unpaired(&rgb, "ground truth", format!("{} or .npy", at(&name, "gt"))));
             };
             let (sparse, scale) = (take(&mut measured, &name), scale(&name));
-            entries.push(Entry { name, rgb, gt, sparse, scale });
+            frames.push(Frame { name, files: Files { rgb, gt, sparse, scale } });
         }
         truths.append(&mut measured);
         all_taken(truths, |name| format!("{} or .jpg", at(name, "rgb")))?;
-        Ok(Self { entries })
+        Ok(Self { frames })
     }
 }
 
-impl Dataset for FolderDataset {
-    fn len(&self) -> usize {
-        self.entries.len()
+impl Loader for FolderDataset {
+    type Files = Files;
+
+    fn frames(&self) -> &[Frame<Files>] {
+        &self.frames
     }
 
-    fn name(&self, index: usize) -> String {
-        self.entries.get(index).map(|e| e.name.clone()).unwrap_or_default()
+    fn brings_measurements(&self, files: &Files) -> bool {
+        files.sparse.is_some()
     }
 
-    fn has_measurements(&self, index: usize) -> bool {
-        self.entries.get(index).is_some_and(|e| e.sparse.is_some())
-    }
-
-    fn load(&self, index: usize) -> Result<Sample> {
-        let entry = entry(&self.entries, index)?;
-        let rgb = picture(&entry.rgb)?;
-        let gt = depth(&entry.gt, entry.scale, &rgb)?.as_slice().to_vec();
-        let sparse = entry.sparse.as_ref().map(|path| depth(path, entry.scale, &rgb)).transpose()?;
-        Ok(Sample { name: entry.name.clone(), rgb, gt, sparse, masks: Vec::new() })
+    fn read(&self, frame: &Frame<Files>, _: usize) -> Result<Sample> {
+        let Files { rgb, gt, sparse, scale } = &frame.files;
+        let rgb = picture(rgb)?;
+        let gt = depth(gt, *scale, &rgb)?.as_slice().to_vec();
+        let sparse = sparse.as_ref().map(|path| depth(path, *scale, &rgb)).transpose()?;
+        Ok(Sample { name: frame.name.clone(), rgb, gt, sparse, masks: Vec::new() })
     }
 }
 
@@ -137,6 +135,7 @@ fn in_units(metres: f32, scale: DepthScale) -> u16 {
 
 #[cfg(test)]
 mod tests {
+    use super::super::Dataset;
     use super::*;
     use crate::scenes::procedural;
 

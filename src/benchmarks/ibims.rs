@@ -4,9 +4,10 @@ use std::path::{Path, PathBuf};
 
 use image::{Rgb, RgbImage};
 
-use super::files::{lines, list_some, naming, some_valid};
+use super::files::{lines, list_some, naming};
+use super::listing::{Frame, Loader};
 use super::mat::Record;
-use super::{Dataset, Mask, Sample, entry};
+use super::{Mask, Sample};
 use crate::depth::SparseDepth;
 use crate::depth::pixels::pixel_count;
 use crate::error::{Error, Result};
@@ -32,7 +33,7 @@ const MASKS: [(&str, &str, bool); 6] = [
 /// `floor`; true where the pixel is what the name says.
 #[derive(Clone, Debug)]
 pub struct IbimsDataset {
-    entries: Vec<(String, PathBuf)>,
+    frames: Vec<Frame<PathBuf>>,
 }
 
 impl IbimsDataset {
@@ -47,39 +48,34 @@ impl IbimsDataset {
         let files = list_some(place.map_or(dir, PathBuf::as_path), &["mat"])?;
         let list = dir.join("imagelist.txt");
         if !list.is_file() {
-            return Ok(Self { entries: files });
+            let frames = files.into_iter().map(|(name, files)| Frame { name, files });
+            return Ok(Self { frames: frames.collect() });
         }
-        let mut entries = Vec::new();
+        let mut frames = Vec::new();
         for line in lines(&list)? {
             let name = line.strip_suffix(".mat").unwrap_or(&line);
-            let Some(file) = files.iter().find(|(n, _)| n == name) else {
+            let Some((_, file)) = files.iter().find(|(n, _)| n == name) else {
                 let expected = format!("{name}.mat beside the other files");
                 return Err(Error::format(&list, format!("frame {name:?}, which has no file"), expected));
             };
-            entries.push(file.clone());
+            frames.push(Frame { name: name.to_string(), files: file.clone() });
         }
-        if entries.is_empty() {
+        if frames.is_empty() {
             return Err(Error::format(&list, "no name", "one frame per line"));
         }
-        Ok(Self { entries })
+        Ok(Self { frames })
     }
 }
 
-impl Dataset for IbimsDataset {
-    fn len(&self) -> usize {
-        self.entries.len()
+impl Loader for IbimsDataset {
+    type Files = PathBuf;
+
+    fn frames(&self) -> &[Frame<PathBuf>] {
+        &self.frames
     }
 
-    fn name(&self, index: usize) -> String {
-        self.entries.get(index).map(|e| e.0.clone()).unwrap_or_default()
-    }
-
-    fn has_measurements(&self, _: usize) -> bool {
-        false
-    }
-
-    fn load(&self, index: usize) -> Result<Sample> {
-        let (name, path) = entry(&self.entries, index)?;
+    fn read(&self, frame: &Frame<PathBuf>, _: usize) -> Result<Sample> {
+        let path = &frame.files;
         let data = Record::read(path, "data")?;
         let shape = data.field("depth").map(|d| d.shape.clone()).unwrap_or_default();
         let [h, w] = shape[..] else {
@@ -108,9 +104,8 @@ impl Dataset for IbimsDataset {
             masks.iter().filter(named).any(|m| m.pixels[i])
         };
         let gt = depth.iter().enumerate().map(|(i, &d)| if excluded(i) { f32::NAN } else { d as f32 });
-        let gt = SparseDepth::new(w, h, gt.collect()).map_err(|e| naming(path, e))?;
-        let gt = some_valid(path, gt)?.as_slice().to_vec();
-        Ok(Sample { name: name.clone(), rgb, gt, sparse: None, masks })
+        let gt = SparseDepth::new(w, h, gt.collect()).map_err(|e| naming(path, e))?.as_slice().to_vec();
+        Ok(Sample { name: frame.name.clone(), rgb, gt, sparse: None, masks })
     }
 }
 

@@ -2,15 +2,15 @@
 
 use std::path::{Path, PathBuf};
 
-use super::files::{all_taken, depth, first_with, list, list_some, picture, some_valid, take, unpaired};
+use super::Sample;
+use super::files::{all_taken, depth, first_with, list, list_some, picture, take, unpaired};
+use super::listing::{Frame, Loader};
 use super::outliers::{THRESHOLD, WINDOW, remove_outliers};
-use super::{Dataset, Sample, entry};
 use crate::depth::DepthScale;
 use crate::error::Result;
 
 #[derive(Clone, Debug)]
-struct Entry {
-    name: String,
+pub(super) struct Files {
     rgb: PathBuf,
     gt: PathBuf,
     sparse: PathBuf,
@@ -24,7 +24,7 @@ struct Entry {
 /// truth, cleaned by its makers, does not. Its nearest and farthest values all count, as in Marigold-DC.
 #[derive(Clone, Debug)]
 pub struct KittiDataset {
-    entries: Vec<Entry>,
+    frames: Vec<Frame<Files>>,
 }
 
 impl KittiDataset {
@@ -37,7 +37,7 @@ impl KittiDataset {
         let dir = first_with(dir.as_ref(), &places, "image")?;
         let mut truths = list(&dir.join("groundtruth_depth"), &["png"])?;
         let mut measured = list(&dir.join("velodyne_raw"), &["png"])?;
-        let mut entries = Vec::new();
+        let mut frames = Vec::new();
         for (name, rgb) in list_some(&dir.join("image"), &["png"])? {
             let partner = |files: &mut _, kind: &str| {
                 let partner = name.replacen("_image_", &format!("_{kind}_"), 1);
@@ -45,34 +45,31 @@ impl KittiDataset {
             };
             let gt = partner(&mut truths, "groundtruth_depth")?;
             let sparse = partner(&mut measured, "velodyne_raw")?;
-            entries.push(Entry { name, rgb, gt, sparse });
+            frames.push(Frame { name, files: Files { rgb, gt, sparse } });
         }
         all_taken(truths, |n| format!("image/{}.png", n.replacen("_groundtruth_depth_", "_image_", 1)))?;
         all_taken(measured, |n| format!("image/{}.png", n.replacen("_velodyne_raw_", "_image_", 1)))?;
-        Ok(Self { entries })
+        Ok(Self { frames })
     }
 }
 
-impl Dataset for KittiDataset {
-    fn len(&self) -> usize {
-        self.entries.len()
+impl Loader for KittiDataset {
+    type Files = Files;
+
+    fn frames(&self) -> &[Frame<Files>] {
+        &self.frames
     }
 
-    fn name(&self, index: usize) -> String {
-        self.entries.get(index).map(|e| e.name.clone()).unwrap_or_default()
+    fn brings_measurements(&self, _: &Files) -> bool {
+        true
     }
 
-    fn has_measurements(&self, index: usize) -> bool {
-        index < self.entries.len()
-    }
-
-    fn load(&self, index: usize) -> Result<Sample> {
-        let Entry { name, rgb, gt, sparse } = entry(&self.entries, index)?;
+    fn read(&self, frame: &Frame<Files>, _: usize) -> Result<Sample> {
+        let Files { rgb, gt, sparse } = &frame.files;
         let scale = Some(DepthScale::kitti());
         let rgb = picture(rgb)?;
         let gt = depth(gt, scale, &rgb)?.as_slice().to_vec();
         let measured = remove_outliers(&depth(sparse, scale, &rgb)?, WINDOW, THRESHOLD)?;
-        let measured = some_valid(sparse, measured)?;
-        Ok(Sample { name: name.clone(), rgb, gt, sparse: Some(measured), masks: Vec::new() })
+        Ok(Sample { name: frame.name.clone(), rgb, gt, sparse: Some(measured), masks: Vec::new() })
     }
 }

@@ -15,15 +15,17 @@ mod folder;
 mod hdf5;
 mod ibims;
 mod kitti;
+mod listing;
 mod lzf;
 mod mat;
 mod nyu;
 pub mod outliers;
+mod parts;
 mod scannet;
 mod tum;
 mod void;
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 use image::RgbImage;
@@ -37,6 +39,7 @@ pub use folder::{DepthFile, FolderDataset, write_frame};
 pub use ibims::IbimsDataset;
 pub use kitti::KittiDataset;
 pub use nyu::NyuDataset;
+use parts::{Chosen, Ranged};
 pub use scannet::ScanNetDataset;
 pub use tum::TumDataset;
 pub use void::VoidDataset;
@@ -59,9 +62,12 @@ pub trait Dataset: Send + Sync {
 
     /// Reads a frame. The same index always gives the same sample.
     ///
+    /// A frame without a single valid depth is no error, since sensors deliver such frames: [`Sample::gt`] is then NaN
+    /// everywhere, or [`Sample::sparse`] has no measurement, and the caller decides what becomes of it.
+    ///
     /// # Errors
-    /// [`Error::Argument`] beyond the last frame; otherwise an error that names the file which cannot be read, has another
-    /// format or size than it should, or holds no valid depth.
+    /// [`Error::Argument`] beyond the last frame; otherwise an error that names the file which cannot be read, or has another
+    /// format or size than it should.
     fn load(&self, index: usize) -> Result<Sample>;
 }
 
@@ -75,7 +81,7 @@ pub struct Sample {
     /// Ground-truth Z-depth, metres, row-major, as many values as `rgb` has pixels; NaN where unknown.
     pub gt: Vec<f32>,
     /// The measurements of a sensor, or the points that the benchmark's authors published, where the data set has them, after
-    /// its outlier rule; for [`DdadDataset`] without hints those that stand in for them.
+    /// its outlier rule; for [`DdadDataset`] without hints those that stand in for them. Perhaps not a single one.
     pub sparse: Option<SparseDepth>,
     /// Regions that the data set marks; empty for most.
     pub masks: Vec<Mask>,
@@ -91,12 +97,13 @@ pub struct Mask {
 }
 
 impl Sample {
-    /// The frame's own measurements; without any, `points` pixels of the ground truth drawn in a pattern.
+    /// The frame's own measurements (perhaps none, see [`Dataset::load`]); where it brings none, `points` pixels of the ground
+    /// truth drawn in a pattern.
     ///
     /// The draw depends on the seed alone (ChaCha8); give each frame its own, as [`frame_seed`] does.
     ///
     /// # Errors
-    /// As [`SparsePattern::sample`].
+    /// As [`SparsePattern::sample`]: ground truth without a valid pixel is [`Error::NoMeasurement`].
     pub fn measurements(&self, points: usize, pattern: SparsePattern, seed: u64) -> Result<SparseDepth> {
         if let Some(sparse) = &self.sparse {
             return Ok(sparse.clone());
@@ -141,7 +148,7 @@ pub enum Layout {
 }
 
 /// What may be chosen when a data set is opened.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct LayoutOptions {
     /// Unit of the integer files of [`Layout::Folder`]. The other layouts have a unit of their own and refuse another.
     pub scale: Option<DepthScale>,
@@ -151,6 +158,10 @@ pub struct LayoutOptions {
     /// Marigold-DC scores. Measurements that the data set brings are never touched; points drawn from the ground truth lie in the
     /// range as it does.
     pub range: Option<(f32, f32)>,
+    /// A text file that names the frames to take, one per line and in its order; `#` starts a comment. A name is that of
+    /// [`Dataset::name`], or `SCENE/NUMBER` as in the published lists of ScanNet's frames, with or without zeros before the
+    /// number. `None`: all frames.
+    pub frames: Option<PathBuf>,
 }
 
 impl Layout {
@@ -208,14 +219,15 @@ impl Layout {
     ///
     /// # Errors
     /// [`Error::Argument`] for an option that the layout does not take and for a range that is empty; otherwise an error that
-    /// names the file or directory which is missing, or has no partner.
+    /// names the file or directory which is missing, or has no partner, or the list of frames with the name that is unknown or
+    /// stands in it twice.
     pub fn open(self, path: impl AsRef<Path>, options: &LayoutOptions) -> Result<Box<dyn Dataset>> {
         let path = path.as_ref();
         if let (Some(scale), true) = (options.scale, self != Layout::Folder) {
             let expected = format!("none: the files of layout {} have a fixed unit", self.name());
             return Err(Error::argument("depth scale", scale.units(), expected));
         }
-        let frames: Box<dyn Dataset> = match self {
+        let mut frames: Box<dyn Dataset> = match self {
             Layout::Folder => Box::new(FolderDataset::open(path, options.scale)?),
             Layout::Nyu => Box::new(NyuDataset::open(path)?),
             Layout::Void => Box::new(VoidDataset::open(path)?),
@@ -225,13 +237,13 @@ impl Layout {
             Layout::Tum => Box::new(TumDataset::open(path)?),
             Layout::ScanNet => Box::new(ScanNetDataset::open(path)?),
         };
-        match options.range {
-            None => Ok(frames),
-            Some((near, far)) if near < far => Ok(Box::new(Ranged { frames, near, far })),
-            Some((near, far)) => {
-                Err(Error::argument("range", format!("{near} to {far} m"), "the nearer depth first"))
-            }
+        if let Some(list) = &options.frames {
+            frames = Box::new(Chosen::by_list(frames, list)?);
         }
+        if let Some(range) = options.range {
+            frames = Box::new(Ranged::new(frames, range)?);
+        }
+        Ok(frames)
     }
 }
 
@@ -249,40 +261,4 @@ impl std::fmt::Display for Layout {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.write_str(self.name())
     }
-}
-
-/// A data set whose ground truth counts only between two depths.
-struct Ranged {
-    frames: Box<dyn Dataset>,
-    near: f32,
-    far: f32,
-}
-
-impl Dataset for Ranged {
-    fn len(&self) -> usize {
-        self.frames.len()
-    }
-
-    fn name(&self, index: usize) -> String {
-        self.frames.name(index)
-    }
-
-    fn has_measurements(&self, index: usize) -> bool {
-        self.frames.has_measurements(index)
-    }
-
-    fn load(&self, index: usize) -> Result<Sample> {
-        let mut sample = self.frames.load(index)?;
-        for depth in &mut sample.gt {
-            if !(self.near..=self.far).contains(depth) {
-                *depth = f32::NAN;
-            }
-        }
-        Ok(sample)
-    }
-}
-
-/// The entry of a frame, or the error for an index beyond the last.
-fn entry<T>(entries: &[T], index: usize) -> Result<&T> {
-    entries.get(index).ok_or_else(|| Error::argument("index", index, format!("below {}", entries.len())))
 }

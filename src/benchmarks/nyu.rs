@@ -4,9 +4,10 @@ use std::path::{Path, PathBuf};
 
 use image::RgbImage;
 
-use super::files::{Listed, list_some, naming, some_valid};
+use super::files::{Listed, list_some, naming};
 use super::hdf5::Numbers;
-use super::{Dataset, Sample, entry};
+use super::listing::entry;
+use super::{Dataset, Sample};
 use crate::depth::SparseDepth;
 use crate::error::{Error, Result};
 
@@ -135,7 +136,7 @@ impl Dataset for NyuDataset {
 }
 
 fn cropped(depth: Vec<f32>, path: &Path) -> Result<SparseDepth> {
-    some_valid(path, SparseDepth::new(CROP.0, CROP.1, depth).map_err(|e| naming(path, e))?)
+    SparseDepth::new(CROP.0, CROP.1, depth).map_err(|e| naming(path, e))
 }
 
 /// A frame's own file, halved and cropped: interleaved colours and depth.

@@ -2,8 +2,9 @@
 
 use std::path::{Path, PathBuf};
 
+use super::Sample;
 use super::files::{below, depth, frame_name, lines, picture, recordings};
-use super::{Dataset, Sample, entry};
+use super::listing::{Frame, Loader};
 use crate::depth::DepthScale;
 use crate::error::{Error, Result};
 
@@ -14,8 +15,7 @@ const LARGEST_GAP: f64 = 0.02;
 const MOST_CANDIDATES: usize = 64;
 
 #[derive(Clone, Debug)]
-struct Entry {
-    name: String,
+pub(super) struct Files {
     rgb: PathBuf,
     gt: PathBuf,
 }
@@ -28,7 +28,7 @@ struct Entry {
 /// neither resized nor cropped and have no measurements of their own.
 #[derive(Clone, Debug)]
 pub struct TumDataset {
-    entries: Vec<Entry>,
+    frames: Vec<Frame<Files>>,
 }
 
 impl TumDataset {
@@ -38,7 +38,7 @@ impl TumDataset {
     /// [`Error::Io`]; [`Error::Format`] naming the list with a line that is no time and path, that leads out of the data set,
     /// or that shares no time with the other.
     pub fn open(dir: impl AsRef<Path>) -> Result<Self> {
-        let mut entries = Vec::new();
+        let mut frames = Vec::new();
         for (recording, dir) in recordings(dir.as_ref(), ["rgb.txt", "depth.txt"])? {
             let (pictures, depths) = (stamped(&dir, "rgb.txt")?, stamped(&dir, "depth.txt")?);
             let times = |files: &[(f64, PathBuf)]| files.iter().map(|f| f.0).collect::<Vec<_>>();
@@ -51,13 +51,13 @@ impl TumDataset {
                 let expected = format!("a time within {LARGEST_GAP} s of one in rgb.txt");
                 return Err(Error::format(dir.join("depth.txt"), "no such time", expected));
             }
-            entries.extend(pairs.into_iter().map(|(i, j)| {
+            frames.extend(pairs.into_iter().map(|(i, j)| {
                 let rgb = pictures[i].1.clone();
                 let stem = rgb.file_stem().and_then(|s| s.to_str()).unwrap_or_default();
-                Entry { name: frame_name(&recording, stem), rgb, gt: depths[j].1.clone() }
+                Frame { name: frame_name(&recording, stem), files: Files { rgb, gt: depths[j].1.clone() } }
             }));
         }
-        Ok(Self { entries })
+        Ok(Self { frames })
     }
 }
 
@@ -105,24 +105,18 @@ fn associate(a: &[f64], b: &[f64]) -> Option<Vec<(usize, usize)>> {
     Some(pairs)
 }
 
-impl Dataset for TumDataset {
-    fn len(&self) -> usize {
-        self.entries.len()
+impl Loader for TumDataset {
+    type Files = Files;
+
+    fn frames(&self) -> &[Frame<Files>] {
+        &self.frames
     }
 
-    fn name(&self, index: usize) -> String {
-        self.entries.get(index).map(|e| e.name.clone()).unwrap_or_default()
-    }
-
-    fn has_measurements(&self, _: usize) -> bool {
-        false
-    }
-
-    fn load(&self, index: usize) -> Result<Sample> {
-        let Entry { name, rgb, gt } = entry(&self.entries, index)?;
+    fn read(&self, frame: &Frame<Files>, _: usize) -> Result<Sample> {
+        let Files { rgb, gt } = &frame.files;
         let rgb = picture(rgb)?;
         let gt = depth(gt, Some(DepthScale::tum()), &rgb)?.as_slice().to_vec();
-        Ok(Sample { name: name.clone(), rgb, gt, sparse: None, masks: Vec::new() })
+        Ok(Sample { name: frame.name.clone(), rgb, gt, sparse: None, masks: Vec::new() })
     }
 }
 

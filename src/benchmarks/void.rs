@@ -4,15 +4,15 @@ use std::path::{Path, PathBuf};
 
 use image::RgbImage;
 
-use super::files::{below, depth, frame_name, lines, naming, picture, same_size, some_valid};
-use super::{Dataset, Sample, entry};
+use super::Sample;
+use super::files::{below, depth, frame_name, lines, naming, picture, same_size};
+use super::listing::{Frame, Loader};
 use crate::depth::io::png16;
 use crate::depth::{DepthScale, SparseDepth};
 use crate::error::{Error, Result};
 
 #[derive(Clone, Debug)]
-struct Entry {
-    name: String,
+pub(super) struct Files {
     rgb: PathBuf,
     sparse: PathBuf,
     validity: PathBuf,
@@ -30,7 +30,7 @@ struct Entry {
 /// [`super::LayoutOptions`]), Marigold-DC and the paper all of it, which is the default.
 #[derive(Clone, Debug)]
 pub struct VoidDataset {
-    entries: Vec<Entry>,
+    frames: Vec<Frame<Files>>,
 }
 
 impl VoidDataset {
@@ -57,11 +57,11 @@ impl VoidDataset {
         let mut columns = columns.into_iter().map(Vec::into_iter);
         let mut next = || columns.next().unwrap_or_default();
         let (rgb, sparse, validity, gt) = (next(), next(), next(), next());
-        let entries = rgb.zip(sparse).zip(validity).zip(gt).map(|(((rgb, sparse), validity), gt)| {
-            let name = name_of(&rgb);
-            Entry { name, rgb, sparse, validity, gt }
+        let frames = rgb.zip(sparse).zip(validity).zip(gt).map(|(((rgb, sparse), validity), gt)| Frame {
+            name: name_of(&rgb),
+            files: Files { rgb, sparse, validity, gt },
         });
-        Ok(Self { entries: entries.collect() })
+        Ok(Self { frames: frames.collect() })
     }
 }
 
@@ -86,26 +86,24 @@ fn name_of(rgb: &Path) -> String {
     frame_name(&sequence, &text(rgb.file_stem()))
 }
 
-impl Dataset for VoidDataset {
-    fn len(&self) -> usize {
-        self.entries.len()
+impl Loader for VoidDataset {
+    type Files = Files;
+
+    fn frames(&self) -> &[Frame<Files>] {
+        &self.frames
     }
 
-    fn name(&self, index: usize) -> String {
-        self.entries.get(index).map(|e| e.name.clone()).unwrap_or_default()
+    fn brings_measurements(&self, _: &Files) -> bool {
+        true
     }
 
-    fn has_measurements(&self, index: usize) -> bool {
-        index < self.entries.len()
-    }
-
-    fn load(&self, index: usize) -> Result<Sample> {
-        let Entry { name, rgb, sparse, validity, gt } = entry(&self.entries, index)?;
+    fn read(&self, frame: &Frame<Files>, _: usize) -> Result<Sample> {
+        let Files { rgb, sparse, validity, gt } = &frame.files;
         let scale = Some(DepthScale::kitti());
         let rgb = picture(rgb)?;
         let gt = depth(gt, scale, &rgb)?.as_slice().to_vec();
         let sparse = valid_only(&depth(sparse, scale, &rgb)?, validity, &rgb)?;
-        Ok(Sample { name: name.clone(), rgb, gt, sparse: Some(sparse), masks: Vec::new() })
+        Ok(Sample { name: frame.name.clone(), rgb, gt, sparse: Some(sparse), masks: Vec::new() })
     }
 }
 
@@ -114,5 +112,5 @@ fn valid_only(sparse: &SparseDepth, path: &Path, rgb: &RgbImage) -> Result<Spars
     same_size(path, (w, h), rgb)?;
     let keep = |(&depth, &valid): (&f32, &u16)| if valid == 0 { f32::NAN } else { depth };
     let kept = sparse.as_slice().iter().zip(&validity).map(keep).collect();
-    some_valid(path, SparseDepth::new(w, h, kept)?)
+    SparseDepth::new(w, h, kept)
 }

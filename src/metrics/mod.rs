@@ -5,6 +5,7 @@
 
 mod bootstrap;
 mod confidence;
+mod relative;
 mod structure;
 
 pub use bootstrap::{Interval, bootstrap_mean, bootstrap_ratio};
@@ -12,6 +13,7 @@ pub use confidence::{
     Calibration, CalibrationBin, ConfidenceScores, Sparsification, calibration, score_confidence,
     sparsification,
 };
+pub use relative::RelativeError;
 pub use structure::{DISTANCE_LIMITS, EdgeRule, Regions, gradient_error};
 
 use serde::{Deserialize, Serialize};

@@ -2,12 +2,12 @@
 
 use std::fs;
 
-use sdim::benchmarks::{Layout, LayoutOptions, frame_seed};
+use sdim::benchmarks::{DepthFile, Layout, LayoutOptions, frame_seed, write_frame};
 use sdim::depth::SparsePattern;
 use sdim::depth::io::npy;
 use sdim::{DepthScale, Error};
 
-use crate::copies::{H, W, kitti, picture};
+use crate::copies::{H, W, kitti, picture, scannet};
 use crate::{all, points, says};
 
 #[test]
@@ -53,6 +53,60 @@ fn a_range_takes_away_ground_truth_and_nothing_else() {
 }
 
 #[test]
+fn a_list_chooses_frames_in_its_order() {
+    let dir = tempfile::tempdir().unwrap();
+    for scene in ["scene0707_00", "scene0708_00"] {
+        scannet(&dir.path().join(scene));
+    }
+    let list = dir.path().join("split.txt");
+    let options = LayoutOptions { frames: Some(list.clone()), ..Default::default() };
+    let open = |names: &str| {
+        fs::write(&list, names).unwrap();
+        Layout::ScanNet.open(dir.path(), &options)
+    };
+    // As published, with zeros as another export has them, and by our own name.
+    let set = open("# choice\nscene0708_00/10\nscene0707_00/0002\n\nscene0707_00-10\n").unwrap();
+    let names: Vec<String> = (0..4).map(|i| set.name(i)).collect();
+    assert_eq!(
+        (set.len(), &names[..]),
+        (3, ["scene0708_00-10", "scene0707_00-2", "scene0707_00-10", ""].map(String::from).as_slice())
+    );
+    for (index, name) in names[..3].iter().enumerate() {
+        assert_eq!(set.load(index).unwrap().name, *name);
+    }
+    assert!(matches!(set.load(3), Err(Error::Argument { name: "index", .. })));
+    assert!(!set.has_measurements(0));
+    for (wrong, what) in [
+        ("scene0707_00/3", "\"scene0707_00/3\", no such frame; expected names of the data set's 6 frames"),
+        ("scene0707_00/2\nscene0707_00-2", "\"scene0707_00-2\" twice"),
+        ("# nothing\n", "no name"),
+    ] {
+        let error = open(wrong).map(|_| ()).unwrap_err().to_string();
+        assert!(error.contains("split.txt") && error.contains(what), "{error}");
+    }
+    fs::remove_file(&list).unwrap();
+    assert!(matches!(Layout::ScanNet.open(dir.path(), &options), Err(Error::Io { .. })));
+
+    // Any layout, with its measurements; a name itself goes before what else is spelled like it.
+    let dir = tempfile::tempdir().unwrap();
+    let frame = sdim::scenes::procedural(3, 16, 12).unwrap();
+    for name in ["07", "7", "8"] {
+        write_frame(dir.path(), name, &frame, DepthFile::Npy).unwrap();
+    }
+    fs::create_dir(dir.path().join("sparse")).unwrap();
+    npy::write_npy(dir.path().join("sparse/7.npy"), 16, 12, &[1.0; 192]).unwrap();
+    let list = dir.path().join("list.txt");
+    fs::write(&list, "7\n07\n008").unwrap();
+    let options = LayoutOptions { frames: Some(list.clone()), ..Default::default() };
+    let set = Layout::Folder.open(dir.path(), &options).unwrap();
+    assert_eq!([0, 1, 2].map(|i| set.name(i)), ["7", "07", "8"]);
+    assert_eq!([0, 1, 2, 3].map(|i| set.has_measurements(i)), [true, false, false, false]);
+    fs::write(&list, "007").unwrap();
+    let error = Layout::Folder.open(dir.path(), &options).map(|_| ()).unwrap_err().to_string();
+    assert!(error.contains("007"), "two frames are spelled like it: {error}");
+}
+
+#[test]
 fn marigolds_folders() {
     let dir = tempfile::tempdir().unwrap();
     let at = |name: &str| dir.path().join(name);
@@ -77,7 +131,9 @@ fn marigolds_folders() {
     assert_eq!(sample.measurements(9, SparsePattern::Uniform, 1).unwrap().measured(), 1);
 
     npy::write_npy(at("sparse/0000.npy"), W, H, &[0.0; W * H]).unwrap();
-    says(Layout::Folder, dir.path(), &["sparse", "0000.npy", "no valid depth"]);
+    let sample = all(Layout::Folder, dir.path()).unwrap().remove(0);
+    assert!(points(&sample).is_empty(), "a frame without a measurement is one to skip, not a damaged one");
+    assert_eq!(sample.measurements(9, SparsePattern::Uniform, 1).unwrap().measured(), 0);
     npy::write_npy(at("sparse/0000.npy"), W, H, &[2.0e4; W * H]).unwrap();
     says(Layout::Folder, dir.path(), &["0000.npy", "20000"]);
     fs::remove_file(at("sparse/0000.npy")).unwrap();

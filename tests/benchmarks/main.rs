@@ -41,12 +41,20 @@ fn says(layout: Layout, dir: &Path, needles: &[&str]) {
     }
 }
 
+/// Number of frames, all of which can be loaded, without valid ground truth or without measurements where they bring some.
+fn without_depth(layout: Layout, dir: &Path) -> usize {
+    let nothing =
+        |s: &&Sample| s.gt.iter().all(|d| d.is_nan()) || s.sparse.as_ref().is_some_and(|s| s.measured() == 0);
+    all(layout, dir).unwrap().iter().filter(nothing).count()
+}
+
 /// The usual damage to a 16-bit depth file, each undone afterwards.
 #[track_caller]
 fn damage(layout: Layout, dir: &Path, file: &str) {
     let path = dir.join(file);
     let name = path.file_name().unwrap().to_str().unwrap();
     let whole = fs::read(&path).unwrap();
+    assert_eq!(without_depth(layout, dir), 0);
     fs::write(&path, &whole[..whole.len() / 2]).unwrap();
     says(layout, dir, &[name]);
     fs::write(&path, b"").unwrap();
@@ -54,7 +62,7 @@ fn damage(layout: Layout, dir: &Path, file: &str) {
     grey8(&path);
     says(layout, dir, &[name, "8-bit grey"]);
     depth(path.clone(), |_, _| 0);
-    says(layout, dir, &[name, "no valid depth"]);
+    assert_eq!(without_depth(layout, dir), 1, "{name}: no damage, but nothing was measured");
     png16::write_png16(&path, W, H + 1, &[300; W * (H + 1)]).unwrap();
     says(layout, dir, &[name, "24x17", "24x16"]);
     let mut lie = whole.clone();

@@ -5,7 +5,7 @@ use std::fs;
 use sdim::Error;
 use sdim::benchmarks::{Layout, LayoutOptions};
 
-use crate::copies::{DRIVE, H, W, ddad, kitti, picture, void};
+use crate::copies::{DRIVE, H, W, ddad, depth, kitti, picture, void};
 use crate::{all, damage, open, points, says};
 
 #[test]
@@ -50,6 +50,10 @@ fn ddad_takes_the_published_hints_or_a_fifth() {
     assert!(points(&drawn[0]).iter().all(|&(x, y, d)| drawn[0].gt[y * W + x] == d));
     assert_ne!(points(&drawn[0]), points(&drawn[1]));
     assert_eq!(points(&drawn[1]), points(&all(Layout::Ddad, dir.path()).unwrap()[1]));
+    // A frame of which nothing is known has no fifth.
+    depth(dir.path().join("pregenerated/val/gt/0000000001.png"), |_, _| 0);
+    let empty = all(Layout::Ddad, dir.path()).unwrap().remove(1);
+    assert!(empty.gt.iter().all(|d| d.is_nan()) && points(&empty).is_empty());
     let options = LayoutOptions { seed: 1, ..Default::default() };
     let other = Layout::Ddad.open(dir.path(), &options).unwrap();
     assert_eq!(points(&other.load(0).unwrap()).len(), 39);

@@ -2,10 +2,12 @@
 
 use std::fs;
 
+use image::{Rgb, RgbImage};
 use sdim::benchmarks::Layout;
+use sdim::image::resize::{bicubic, lanczos};
 
 use crate::copies::{H, W, depth, grey8, picture_of, scannet, tum};
-use crate::{all, damage, open, says};
+use crate::{all, damage, open, says, without_depth};
 
 #[test]
 fn tum_joins_by_time() {
@@ -54,6 +56,20 @@ fn scannet_resizes_the_picture_only() {
 }
 
 #[test]
+fn scannet_resizes_by_lanczos_filter() {
+    let dir = tempfile::tempdir().unwrap();
+    scannet(dir.path());
+    let stripes = RgbImage::from_fn(2 * W as u32, 2 * H as u32, |x, y| {
+        Rgb([[0, 255][(x / 3 % 2) as usize], 9 * y as u8, 70])
+    });
+    fs::remove_file(dir.path().join("color/0.jpg")).unwrap();
+    stripes.save(dir.path().join("color/0.png")).unwrap();
+    let rgb = all(Layout::ScanNet, dir.path()).unwrap().remove(0).rgb;
+    assert_eq!(rgb, lanczos(&stripes, W, H));
+    assert_ne!(rgb, bicubic(&stripes, W, H));
+}
+
+#[test]
 fn damaged_scannet() {
     let dir = tempfile::tempdir().unwrap();
     scannet(dir.path());
@@ -65,7 +81,7 @@ fn damaged_scannet() {
     grey8(&file);
     says(Layout::ScanNet, dir.path(), &["10.png", "8-bit"]);
     depth(file.clone(), |_, _| 0);
-    says(Layout::ScanNet, dir.path(), &["10.png", "no valid depth"]);
+    assert_eq!(without_depth(Layout::ScanNet, dir.path()), 1);
     depth(file.clone(), |_, _| 7);
     picture_of(dir.path().join("color/10.jpg"), 2 * W, 2 * H + 2, 1);
     says(Layout::ScanNet, dir.path(), &["10.jpg", "48x34", "24x16"]);

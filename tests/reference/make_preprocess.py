@@ -4,8 +4,8 @@
     pip install -r tests/reference/requirements.txt
     python tests/reference/make_preprocess.py [DIRECTORY]
 
-`resize.json`: rows of width, height, new width, new height and the CRC-32 of Pillow's bicubic resize of a picture that
-`tests/preprocess.rs` computes as `picture()` does here. `limits.json`: preprocessor configs, image sizes, and the grid
+`resize.json`: rows of width, height, new width, new height and the CRC-32 of Pillow's bicubic and Lanczos resizes of a picture
+that `tests/preprocess.rs` computes as `picture()` does here. `limits.json`: preprocessor configs, image sizes, and the grid
 that the image processor makes of them, or null where it raises. `files.json`: pixels of image files as `load_image`
 reads them, hexadecimal.
 """
@@ -58,11 +58,15 @@ def resizes():
     sizes = np.exp(rng.uniform(0, np.log(400), (200, 4))).astype(int).tolist()
     sizes += [[w, h, w, max(1, h // 2)] for w, h in rng.integers(1, 90, (10, 2)).tolist()]
     sizes += [[w, h, w * 3 // 2 + 1, h] for w, h in rng.integers(1, 90, (10, 2)).tolist()]
-    sizes += [[640, 480, 644, 476], [480, 640, 476, 644], [1, 1, 56, 56], [1, 1, 1, 1], [5, 700, 28, 1400], [2000, 10, 56, 28]]
+    # The last is that of ScanNet's pictures.
+    sizes += [[640, 480, 644, 476], [480, 640, 476, 644], [1, 1, 56, 56], [1, 1, 1, 1], [5, 700, 28, 1400], [2000, 10, 56, 28], [1296, 968, 640, 480]]
     for w, h, new_w, new_h in sizes:
         image = picture(w, h)
-        assert_columns_first(image, (new_w, new_h))
-        yield [w, h, new_w, new_h, zlib.crc32(image.resize((new_w, new_h), Image.BICUBIC).tobytes())]
+        row = [w, h, new_w, new_h]
+        for method in [Image.BICUBIC, Image.LANCZOS]:
+            assert_columns_first(image, (new_w, new_h), method)
+            row.append(zlib.crc32(image.resize((new_w, new_h), method).tobytes()))
+        yield row
 
 
 def limits():

@@ -2,7 +2,7 @@
 
 use crate::Score;
 
-use super::{MethodTable, Table, Tables};
+use super::{MethodTable, REFERENCE, RELATIVE, Skipped, Table, Tables};
 use sdim::metrics::{Interval, METRICS, Metric};
 use std::fmt::Write;
 
@@ -40,19 +40,14 @@ fn table(text: &mut String, t: &Table) {
     };
     let _ =
         writeln!(text, "\n## {title}\n\n{} frames, {:.0} measured pixels in the mean.", t.frames, t.measured);
-    if !t.skipped.is_empty() {
-        let _ = writeln!(
-            text,
-            "\nNot scored, for want of ground truth or measurements: {}.",
-            t.skipped.join(", ")
-        );
-    }
+    skipped(text, t);
     if t.methods.is_empty() {
         return;
     }
     let (main, others): (Vec<&Metric>, Vec<&Metric>) = METRICS.iter().partition(|m| MAIN.contains(&m.name));
     let columns = main.iter().map(|m| metric(t, m, true)).chain([ratio(t)]);
     rows(text, t, columns.collect());
+    relative(text, t);
     let gradient = plain("GE m", t, false, |m| m.gradient_error.map(|g| g.value));
     rows(text, t, others.iter().map(|m| metric(t, m, false)).chain([gradient]).collect());
     let regions = t.methods.first().map_or(&[][..], |m| &m.regions);
@@ -72,6 +67,21 @@ fn table(text: &mut String, t: &Table) {
             let values: Vec<String> = names.iter().map(|n| digits(m.confidence.get(*n).copied())).collect();
             let _ = writeln!(text, "| {} | {} |", m.name, values.join(" | "));
         }
+    }
+}
+
+/// Frames by the reason for which they were left out.
+fn skipped(text: &mut String, t: &Table) {
+    let mut reasons: Vec<(&str, Vec<&str>)> = Vec::new();
+    for Skipped { frame, reason } in &t.skipped {
+        match reasons.iter_mut().find(|(known, _)| known == reason) {
+            Some((_, frames)) => frames.push(frame),
+            None => reasons.push((reason, vec![frame])),
+        }
+    }
+    for (reason, frames) in reasons {
+        let (n, of) = (frames.len(), t.frames + t.skipped.len());
+        let _ = writeln!(text, "\nSkipped, {n} of {of} frames, {reason}: {}.", frames.join(", "));
     }
 }
 
@@ -96,8 +106,41 @@ fn metric(t: &Table, metric: &Metric, intervals: bool) -> Column {
     (head, cells)
 }
 
+/// Geometric means, and on how many frames a method is better than the reference.
+fn relative(text: &mut String, t: &Table) {
+    if t.methods.len() < 2 {
+        return;
+    }
+    let instead = if t.reference == REFERENCE { "" } else { ", since `linear` was not run" };
+    let _ = writeln!(
+        text,
+        "\nErrors by those of `{}`{instead} on the same frame: geometric mean over frames, and the frames on which the method is better.",
+        t.reference
+    );
+    let columns = RELATIVE.map(|(key, head)| {
+        let cell = |m: &MethodTable| match m.relative.get(key).filter(|_| m.name != t.reference) {
+            None => String::new(),
+            Some(r) => {
+                let (value, interval) = (r.geometric_mean.map(|i| i.value), brackets(r.geometric_mean));
+                let zero =
+                    if r.without_ratio > 0 { format!(", {} at 0", r.without_ratio) } else { String::new() };
+                format!("{}{interval}, {} of {}{zero}", digits(value), r.better, r.frames)
+            }
+        };
+        (format!("{head} : {}", t.reference), t.methods.iter().map(cell).collect())
+    });
+    rows(text, t, columns.into());
+    if t.methods.iter().flat_map(|m| m.relative.values()).any(|r| r.without_ratio > 0) {
+        let _ = writeln!(
+            text,
+            "\n`n at 0`: frames on which the method or `{}` has no error at all; they are compared, but in no geometric mean.",
+            t.reference
+        );
+    }
+}
+
 fn ratio(t: &Table) -> Column {
-    let head = format!("MAE : {}", t.reference);
+    let head = format!("mean MAE : {}'s", t.reference);
     let cell = |m: &MethodTable| match m.mae_ratio {
         Some(i) if m.name != t.reference => format!("{:.2} ({:.2} to {:.2})", i.value, i.low, i.high),
         _ => String::new(),
