@@ -2,9 +2,9 @@
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use sdim::depth::sample_points;
-use sdim::fusion::Normalise;
-use sdim::model::ask;
-use sdim::query::Query;
+use sdim::internals::fusion::Normalise;
+use sdim::internals::model::ask;
+use sdim::internals::query::Query;
 use sdim::refine::{Answered, EdgeAwareFill, Fill, FillInput};
 use sdim::scenes::procedural;
 use sdim::{CompleteOptions, DepthCompleter, QueryPlan};

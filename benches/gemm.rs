@@ -8,7 +8,7 @@ use candle_core::{Device, Tensor};
 use clap::Parser;
 use cpu_time::ThreadTime;
 use sdim::WeightFormat;
-use sdim::kernels::{PackedGate, PackedWeight, Rows};
+use sdim::internals::kernels::{PackedGate, PackedWeight, Rows};
 use std::time::Instant;
 
 #[derive(Parser)]

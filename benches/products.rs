@@ -9,9 +9,9 @@ mod shapes;
 
 use candle_core::{Device, Tensor};
 use criterion::{BenchmarkId, Criterion, SamplingMode, Throughput, criterion_group, criterion_main};
-use sdim::kernels::{PackedGate, Rows, swiglu};
-use sdim::vlm::layers::matrix::Matrix;
-use sdim::vlm::qwen2_5::config::VlmConfig;
+use sdim::internals::kernels::{PackedGate, Rows, swiglu};
+use sdim::internals::vlm::layers::matrix::Matrix;
+use sdim::internals::vlm::qwen2_5::config::VlmConfig;
 use sdim::{Result, WeightFormat};
 use std::cell::LazyCell;
 use std::time::Duration;

@@ -7,10 +7,9 @@
 mod stdout;
 
 use clap::Parser;
-use sdim::kernels::WeightFormat;
-use sdim::read_rgb;
+use sdim::chat::{AnswerOptions, ChatModel, Sampling};
 use sdim::system::device;
-use sdim::vlm::chat::{AnswerOptions, ChatModel, Sampling};
+use sdim::{WeightFormat, read_rgb};
 use serde_json::json;
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -63,7 +62,7 @@ fn checkpoint(model: &str) -> sdim::Result<PathBuf> {
 }
 
 fn run(args: &Args) -> sdim::Result<String> {
-    sdim::kernels::keep_freed_memory();
+    sdim::internals::kernels::keep_freed_memory();
     let image = read_rgb(&args.image)?;
     let model = ChatModel::load_as(checkpoint(&args.model)?, &device(&args.device)?, args.dtype)?;
     let options = AnswerOptions {

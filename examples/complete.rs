@@ -96,7 +96,7 @@ fn error_json(e: &Errors) -> Value {
 
 fn main() -> anyhow::Result<()> {
     let args = Args::parse();
-    sdim::kernels::keep_freed_memory();
+    sdim::internals::kernels::keep_freed_memory();
     let inputs = args.inputs();
     let start = Instant::now();
     let device = device(&args.device)?;

@@ -8,7 +8,7 @@
 
 use anyhow::Context;
 use clap::Parser;
-use sdim::query::Settings;
+use sdim::settings::Settings;
 use sdim::supervise::{LabelSource, TrainConfig, Trainer, evaluate};
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -81,7 +81,7 @@ fn score(row: &str) -> Option<f32> {
 
 fn main() -> anyhow::Result<()> {
     let args = Args::parse();
-    sdim::kernels::keep_freed_memory();
+    sdim::internals::kernels::keep_freed_memory();
     let mut config =
         TrainConfig { steps: args.steps, seed: args.seed, rate: args.rate, ..Default::default() };
     config.batch.frames = args.frames;

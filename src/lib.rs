@@ -57,13 +57,13 @@
 //!
 //! | module | what |
 //! |---|---|
-//! | [`complete`] | one frame, start to end: options, progress, cancelling |
+//! | this one | [`DepthCompleter`]: one frame, start to end; its options, progress, cancelling; [`LoadOptions`], [`Adapter`] |
 //! | [`depth`] | sparse and dense maps, cameras, sampling patterns, files, interpolation |
-//! | `classical`, `metrics`, `draw` | completion without a model; errors and intervals; colours and figures |
+//! | [`classical`], [`metrics`], [`draw`] | completion without a model; errors and intervals; colours and figures |
 //! | [`refine`] | the trait `Fill`: how pixels that were not asked are filled |
-//! | [`model`], [`query`] | how a checkpoint is loaded and asked: [`LoadOptions`], adapters, the settings in `sdim.json` |
-//! | [`vlm`] | plain Qwen2.5-VL: ask a published checkpoint about a picture (`ChatModel`) |
-//! | [`error`] | the one error type |
+//! | [`settings`] | how a checkpoint is asked: `sdim.json` |
+//! | [`chat`] | plain Qwen2.5-VL: ask a published checkpoint about a picture ([`chat::ChatModel`]) |
+//! | [`system`] | devices by name, memory |
 //! | `scenes`, `supervise`, `benchmarks`, `hub` | procedural scenes, training, data sets, the Hugging Face hub; each behind its feature |
 //!
 //! # Features
@@ -89,34 +89,79 @@
 #[cfg(feature = "benchmarks")]
 pub mod benchmarks;
 pub mod classical;
-pub mod complete;
+mod complete;
 pub mod depth;
 pub mod draw;
-pub mod error;
+mod error;
 mod files;
-pub mod fusion;
+mod fusion;
 #[cfg(feature = "hub")]
 pub mod hub;
-pub mod image;
-pub mod kernels;
+mod image;
+mod kernels;
 pub mod metrics;
-pub mod model;
-pub mod query;
+mod model;
+mod query;
 pub mod refine;
 #[cfg(any(feature = "train", feature = "benchmarks"))]
 pub mod scenes;
 #[cfg(feature = "train")]
 pub mod supervise;
 pub mod system;
-pub mod vlm;
+mod vlm;
 
 pub use self::image::read_rgb;
-pub use complete::{CancelToken, CompleteOptions, Completion, DepthCompleter, Preserve};
-pub use depth::{DepthMap, DepthScale, SparseDepth};
+pub use ::image::RgbImage;
+pub use candle_core::{Device, Tensor};
+pub use complete::{
+    CancelToken, CompleteOptions, Completion, DepthCompleter, Preserve, Progress, ProgressCallback,
+    StageSeconds,
+};
+pub use depth::{DepthMap, DepthScale, Intrinsics, SparseDepth};
 pub use error::{Error, Result};
 pub use kernels::WeightFormat;
-pub use model::{LoadOptions, SdimModel};
-pub use query::{AnswerMode, QueryPlan};
+pub use model::{Adapter, LoadOptions};
+pub use query::QueryPlan;
+
+/// What `sdim.json` says: how a checkpoint is asked, and what an adapter adds to it.
+pub mod settings {
+    pub use crate::fusion::FusionConfig;
+    pub use crate::query::{
+        AnswerMode, DepthUnit, Generation, Hint, Marker, MarkerShape, MeasurementPrompt, NumberFormat,
+        PixelReference, PromptTemplate, Settings,
+    };
+    pub use crate::vlm::checkpoint::lora::{LoraConfig, LoraMode};
+    pub use crate::vlm::qwen2_5::rope::RopeLayout;
+}
+
+/// Plain Qwen2.5-VL: asking a published checkpoint about pictures, in words.
+pub mod chat {
+    pub use crate::vlm::chat::template::{ChatPrompt, Part};
+    pub use crate::vlm::chat::{Answer, AnswerOptions, ChatModel, Sampling};
+}
+
+/// For this crate's own tests, benches and measuring examples alone: it changes without notice.
+#[doc(hidden)]
+pub mod internals {
+    pub mod fusion {
+        pub use crate::fusion::*;
+    }
+    pub mod image {
+        pub use crate::image::*;
+    }
+    pub mod kernels {
+        pub use crate::kernels::*;
+    }
+    pub mod model {
+        pub use crate::model::*;
+    }
+    pub mod query {
+        pub use crate::query::*;
+    }
+    pub mod vlm {
+        pub use crate::vlm::*;
+    }
+}
 
 /// The snippet of README.md is a test.
 #[cfg(all(doctest, feature = "tiny"))]

@@ -4,13 +4,10 @@ mod common;
 
 use candle_core::{Device, Tensor};
 use common::tiny;
-use sdim::fusion::FusionConfig;
-use sdim::model::Adapter;
-use sdim::model::{LoadOptions, SdimModel};
-use sdim::query::{PixelReference, Settings};
+use sdim::internals::model::SdimModel;
+use sdim::settings::{FusionConfig, LoraConfig, LoraMode, PixelReference, Settings};
 use sdim::supervise::init::FreshFiles;
-use sdim::vlm::checkpoint::lora::{LoraConfig, LoraMode};
-use sdim::{CompleteOptions, DepthCompleter, Error, QueryPlan, WeightFormat};
+use sdim::{Adapter, CompleteOptions, DepthCompleter, Error, LoadOptions, QueryPlan, WeightFormat};
 use std::path::Path;
 
 /// The way of asking of a base without fusion block.

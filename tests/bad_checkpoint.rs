@@ -5,8 +5,9 @@ mod common;
 use candle_core::{DType, Device, Tensor};
 use common::tiny::{self, Tensors};
 use sdim::Error;
-use sdim::model::{SdimModel, ask};
-use sdim::query::{Query, Settings};
+use sdim::internals::model::{SdimModel, ask};
+use sdim::internals::query::Query;
+use sdim::settings::Settings;
 use sdim::supervise::init::FreshFiles;
 use serde_json::{Value, json};
 use std::path::PathBuf;
@@ -22,7 +23,7 @@ struct Checkpoint {
 impl Checkpoint {
     fn new() -> Self {
         let mut settings = Settings::tiny();
-        settings.number = sdim::query::NumberFormat::Bins { bins: 40, range: 1.25 };
+        settings.number = sdim::settings::NumberFormat::Bins { bins: 40, range: 1.25 };
         let files = tiny::small_files(&settings);
         let tensors = tiny::tensors(&files, 3);
         let dir = tempfile::tempdir().unwrap();

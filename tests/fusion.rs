@@ -6,10 +6,11 @@ use candle_core::{Device, Tensor};
 use common::relative_difference;
 use common::tiny::{self, Tensors};
 use sdim::SparseDepth;
-use sdim::fusion::{BatchStats, Fusion, FusionConfig, Normalise};
-use sdim::model::{SdimModel, ask};
-use sdim::query::{Query, Settings};
-use sdim::vlm::checkpoint::weights::Weights;
+use sdim::internals::fusion::{BatchStats, Fusion, Normalise};
+use sdim::internals::model::{SdimModel, ask};
+use sdim::internals::query::Query;
+use sdim::internals::vlm::checkpoint::weights::Weights;
+use sdim::settings::{FusionConfig, Settings};
 
 const CONFIG: FusionConfig = FusionConfig { branch: 6, high: 10, low: 5 };
 

@@ -8,8 +8,8 @@ mod common;
 use candle_core::Device;
 use sdim::Error;
 use sdim::hub::Hub;
-use sdim::model::SdimModel;
-use sdim::query::Settings;
+use sdim::internals::model::SdimModel;
+use sdim::settings::Settings;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader, Write};
@@ -27,7 +27,7 @@ const FILES: [&str; 5] =
 fn files() -> BTreeMap<String, Vec<u8>> {
     let dir = tempfile::tempdir().unwrap();
     let mut settings = Settings::tiny();
-    settings.number = sdim::query::NumberFormat::Bins { bins: 40, range: 1.25 };
+    settings.number = sdim::settings::NumberFormat::Bins { bins: 40, range: 1.25 };
     let files = common::tiny::small_files(&settings);
     common::tiny::write(dir.path(), &files, &common::tiny::tensors(&files, 3));
     FILES.iter().map(|name| (name.to_string(), std::fs::read(dir.path().join(name)).unwrap())).collect()

@@ -6,8 +6,8 @@ mod common;
 
 use common::random::mix;
 use image::RgbImage;
-use sdim::image::resize::{bicubic, lanczos};
-use sdim::vlm::qwen2_5::preprocess::PreprocessorConfig;
+use sdim::internals::image::resize::{bicubic, lanczos};
+use sdim::internals::vlm::qwen2_5::preprocess::PreprocessorConfig;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 

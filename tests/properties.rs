@@ -2,10 +2,10 @@
 
 use proptest::collection::vec;
 use proptest::prelude::*;
-use sdim::query::number::{DigitReader, read_bins};
-use sdim::query::plan::{lattice, stride_within};
-use sdim::query::prompt::choose_evenly;
-use sdim::vlm::qwen2_5::preprocess::PreprocessorConfig;
+use sdim::internals::query::number::{DigitReader, read_bins};
+use sdim::internals::query::plan::{lattice, stride_within};
+use sdim::internals::query::prompt::choose_evenly;
+use sdim::internals::vlm::qwen2_5::preprocess::PreprocessorConfig;
 use sdim::{DepthScale, Error, SparseDepth};
 
 proptest! {

@@ -2,8 +2,8 @@
 
 use candle_core::{DType, Device, Tensor};
 use sdim::Error;
-use sdim::model::SdimModel;
-use sdim::query::Settings;
+use sdim::internals::model::SdimModel;
+use sdim::settings::Settings;
 use sdim::supervise::{TrainConfig, Trainer};
 use serde_json::{Map, Value, json};
 use std::collections::HashMap;

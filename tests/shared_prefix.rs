@@ -6,17 +6,20 @@ use candle_core::{Device, Tensor};
 use common::{close, relative_difference, tiny};
 use image::RgbImage;
 use sdim::SparseDepth;
-use sdim::kernels::Block;
-use sdim::model::{Prefix, SdimModel, ask};
-use sdim::query::number::{DepthUnit, DigitReader, NumberFormat, Reading, read_bins};
-use sdim::query::prompt::Tokens;
-use sdim::query::{Hint, MeasurementPrompt, PixelReference, Query, Settings};
+use sdim::internals::kernels::Block;
+use sdim::internals::model::{Prefix, SdimModel, ask};
+use sdim::internals::query::Query;
+use sdim::internals::query::number::{DigitReader, Reading, read_bins};
+use sdim::internals::query::prompt::Tokens;
+use sdim::internals::vlm::qwen2_5::cache::KvCache;
+use sdim::internals::vlm::qwen2_5::decoder::{Context, Keep};
+use sdim::internals::vlm::qwen2_5::grid::Grid;
+use sdim::internals::vlm::qwen2_5::rope::Position;
+use sdim::internals::vlm::qwen2_5::sequences::Sequences;
+use sdim::settings::{
+    DepthUnit, Hint, MeasurementPrompt, NumberFormat, PixelReference, RopeLayout, Settings,
+};
 use sdim::supervise::init::FreshFiles;
-use sdim::vlm::qwen2_5::cache::KvCache;
-use sdim::vlm::qwen2_5::decoder::{Context, Keep};
-use sdim::vlm::qwen2_5::grid::Grid;
-use sdim::vlm::qwen2_5::rope::{Position, RopeLayout};
-use sdim::vlm::qwen2_5::sequences::Sequences;
 
 /// Largest difference, relative to the largest value.
 const TOLERANCE: f64 = 1e-4;

@@ -1,6 +1,6 @@
 //! Training: every way of asking can be trained, runs repeat and resume exactly, and the loss falls.
 
-use sdim::query::{MeasurementPrompt, NumberFormat, PixelReference, PromptTemplate, Settings};
+use sdim::settings::{MeasurementPrompt, NumberFormat, PixelReference, PromptTemplate, Settings};
 use sdim::supervise::{LabelSource, TrainConfig, Trainer};
 
 fn small() -> TrainConfig {

@@ -2,10 +2,10 @@
 //!
 //! The lists are not part of the repository: the tests look for a directory beside it and say so when it is not there.
 
-use sdim::vlm::checkpoint::weights::Weights;
-use sdim::vlm::qwen2_5::QwenVl;
-use sdim::vlm::qwen2_5::config::VlmConfig;
-use sdim::vlm::qwen2_5::rope::RopeLayout;
+use sdim::internals::vlm::checkpoint::weights::Weights;
+use sdim::internals::vlm::qwen2_5::QwenVl;
+use sdim::internals::vlm::qwen2_5::config::VlmConfig;
+use sdim::settings::RopeLayout;
 use serde_json::Value;
 use std::collections::{BTreeMap, HashMap};
 use std::path::Path;

@@ -5,10 +5,11 @@
 
 mod common;
 
-use sdim::vlm::chat::template::{ChatPrompt, Message, Part, Role, expand_image_placeholders};
-use sdim::vlm::chat::tokenizer::Tokenizer;
-use sdim::vlm::qwen2_5::config::{SpecialIds, VlmConfig};
-use sdim::vlm::qwen2_5::preprocess::PreprocessorConfig;
+use sdim::chat::{ChatPrompt, Part};
+use sdim::internals::vlm::chat::template::{Message, Role, expand_image_placeholders};
+use sdim::internals::vlm::chat::tokenizer::Tokenizer;
+use sdim::internals::vlm::qwen2_5::config::{SpecialIds, VlmConfig};
+use sdim::internals::vlm::qwen2_5::preprocess::PreprocessorConfig;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 
@@ -135,7 +136,7 @@ fn the_published_template_is_the_one_written_out() {
         template.trim_end(),
         std::fs::read_to_string(dir.join("chat_template.jinja")).unwrap().trim_end()
     );
-    assert!(template.contains(sdim::vlm::chat::template::DEFAULT_SYSTEM));
+    assert!(template.contains(sdim::internals::vlm::chat::template::DEFAULT_SYSTEM));
 }
 
 #[test]

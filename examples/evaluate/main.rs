@@ -226,7 +226,7 @@ impl Args {
 
 fn main() -> anyhow::Result<()> {
     let args = Args::parse();
-    sdim::kernels::keep_freed_memory();
+    sdim::internals::kernels::keep_freed_memory();
     let made =
         if args.merge.is_empty() { run::run(&args)? } else { Some(report::Report::read(&args.merge)?) };
     let Some(report) = made else { return Ok(()) };

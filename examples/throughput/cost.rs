@@ -1,7 +1,7 @@
 //! Floating-point operations of each stage: two per multiplication of a matrix product, nothing else counted.
 
-use sdim::vlm::qwen2_5::config::VlmConfig;
-use sdim::vlm::qwen2_5::grid::Grid;
+use sdim::internals::vlm::qwen2_5::config::VlmConfig;
+use sdim::internals::vlm::qwen2_5::grid::Grid;
 
 pub struct Cost<'a> {
     config: &'a VlmConfig,

@@ -7,7 +7,7 @@
 //! `HF_HUB_DISABLE_IMPLICIT_TOKEN`.
 //!
 //! ```no_run
-//! use sdim::vlm::ChatModel;
+//! use sdim::chat::ChatModel;
 //! let model = ChatModel::from_pretrained("Qwen/Qwen2.5-VL-7B-Instruct", None, &candle_core::Device::Cpu)?;
 //! # Ok::<(), sdim::Error>(())
 //! ```

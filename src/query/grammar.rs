@@ -62,7 +62,7 @@ pub struct AnswerGrammar {
 /// What is wrong with the text.
 ///
 /// ```
-/// use sdim::query::answer::parse_depth;
+/// use sdim::internals::query::parse_depth;
 /// assert_eq!(parse_depth("The current pixel is 3.2 meters away from the camera."), Ok(3.2));
 /// assert_eq!(parse_depth("<think> Near. </think> <answer> 0.85 </answer>"), Ok(0.85));
 /// assert_eq!(parse_depth("850 mm"), Ok(0.85));

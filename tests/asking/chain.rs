@@ -3,11 +3,12 @@
 use crate::common::{beside, close, tiny};
 use crate::setup::{DISC, Setup, by_coordinates, by_marker};
 use candle_core::{Device, Tensor};
-use sdim::model::{SdimModel, ask, ask_as, generate};
-use sdim::query::{
-    AnswerMode, Generation, Marker, MeasurementPrompt, PixelReference, PromptTemplate, Query, Settings,
+use sdim::internals::model::{SdimModel, ask, ask_as, generate};
+use sdim::internals::query::Query;
+use sdim::internals::vlm::chat::tokenizer::Tokenizer;
+use sdim::settings::{
+    AnswerMode, Generation, Marker, MeasurementPrompt, PixelReference, PromptTemplate, Settings,
 };
-use sdim::vlm::chat::tokenizer::Tokenizer;
 use sdim::{CompleteOptions, DepthCompleter, Error, QueryPlan};
 
 /// A model whose next token hangs on the last one alone: after an unmeasured pixel it says `d=4.25m`, where the 4 might

@@ -8,10 +8,11 @@ mod setup;
 
 use candle_core::Tensor;
 use common::{close, relative_difference, tiny};
-use sdim::model::Spoken;
-use sdim::query::{Generation, Marker, PixelReference, PromptTemplate, Query, Settings};
-use sdim::vlm::qwen2_5::decoder::Keep;
-use sdim::vlm::qwen2_5::rope::Position;
+use sdim::internals::model::Spoken;
+use sdim::internals::query::Query;
+use sdim::internals::vlm::qwen2_5::decoder::Keep;
+use sdim::internals::vlm::qwen2_5::rope::Position;
+use sdim::settings::{Generation, Marker, PixelReference, PromptTemplate, Settings};
 use setup::{DISC, Setup, by_coordinates, by_marker};
 
 #[test]

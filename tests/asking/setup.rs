@@ -4,14 +4,14 @@ use crate::common::tiny;
 use candle_core::Tensor;
 use image::RgbImage;
 use sdim::SparseDepth;
-use sdim::model::{Prefix, SdimModel, Spoken, ask_as, generate};
-use sdim::query::number::DigitReader;
-use sdim::query::{
-    AnswerMode, Generation, Marker, MarkerShape, NumberFormat, PixelReference, PromptTemplate, Query,
-    Reading, Settings,
+use sdim::internals::model::{Prefix, SdimModel, Spoken, ask_as, generate};
+use sdim::internals::query::number::DigitReader;
+use sdim::internals::query::{Query, Reading};
+use sdim::internals::vlm::qwen2_5::decoder::Keep;
+use sdim::internals::vlm::qwen2_5::positions::positions;
+use sdim::settings::{
+    AnswerMode, Generation, Marker, MarkerShape, NumberFormat, PixelReference, PromptTemplate, Settings,
 };
-use sdim::vlm::qwen2_5::decoder::Keep;
-use sdim::vlm::qwen2_5::positions::positions;
 
 pub const DIGITS: NumberFormat = NumberFormat::Digits { decimals: 2, integers: 2 };
 pub const DISC: Marker = Marker { shape: MarkerShape::Disc, size: 6, colour: [255, 0, 0] };

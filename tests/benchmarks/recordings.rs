@@ -4,7 +4,7 @@ use std::fs;
 
 use image::{Rgb, RgbImage};
 use sdim::benchmarks::Layout;
-use sdim::image::resize::{bicubic, lanczos};
+use sdim::internals::image::resize::{bicubic, lanczos};
 
 use crate::copies::{H, W, depth, grey8, picture_of, scannet, tum};
 use crate::{all, damage, open, says, without_depth};

@@ -6,7 +6,7 @@ pub mod random;
 pub mod tiny;
 
 use candle_core::{DType, Device, Tensor};
-use sdim::query::Reading;
+use sdim::internals::query::Reading;
 use std::cell::RefCell;
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::path::{Path, PathBuf};

@@ -1,10 +1,10 @@
 //! Random weights whose bits follow from the tensors' names, as `tests/reference/make_family.py` computes them.
 
 use candle_core::{Device, Tensor};
-use sdim::vlm::checkpoint::weights::Weights;
-use sdim::vlm::qwen2_5::QwenVl;
-use sdim::vlm::qwen2_5::config::VlmConfig;
-use sdim::vlm::qwen2_5::rope::RopeLayout;
+use sdim::internals::vlm::checkpoint::weights::Weights;
+use sdim::internals::vlm::qwen2_5::QwenVl;
+use sdim::internals::vlm::qwen2_5::config::VlmConfig;
+use sdim::settings::RopeLayout;
 use std::collections::{BTreeMap, HashMap};
 
 /// The finaliser of MurmurHash3.

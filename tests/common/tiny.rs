@@ -3,11 +3,11 @@
 use candle_core::{Device, Tensor};
 use image::{Rgb, RgbImage};
 use sdim::SparseDepth;
-use sdim::model::SdimModel;
-use sdim::query::Settings;
-use sdim::query::number::Numbers;
+use sdim::internals::model::SdimModel;
+use sdim::internals::query::number::Numbers;
+use sdim::internals::vlm::checkpoint::weights::Weights;
+use sdim::settings::Settings;
 use sdim::supervise::init::{FreshFiles, initial};
-use sdim::vlm::checkpoint::weights::Weights;
 use std::collections::HashMap;
 use std::path::Path;
 

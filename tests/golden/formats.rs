@@ -4,15 +4,16 @@ use super::common::{Allowed, Golden, random};
 use super::family::{Family, NAMES};
 use super::{CPU, json, own_fixture};
 use candle_core::{DType, Tensor};
-use sdim::kernels::WeightFormat::{self, Bf16, F32, Int8};
-use sdim::vlm::checkpoint::weights::Weights;
-use sdim::vlm::qwen2_5::QwenVl;
-use sdim::vlm::qwen2_5::config::VlmConfig;
-use sdim::vlm::qwen2_5::decoder::Keep;
-use sdim::vlm::qwen2_5::grid::Grid;
-use sdim::vlm::qwen2_5::positions::positions;
-use sdim::vlm::qwen2_5::preprocess::PreprocessorConfig;
-use sdim::vlm::qwen2_5::rope::RopeLayout;
+use sdim::WeightFormat;
+use sdim::WeightFormat::{Bf16, F32, Int8};
+use sdim::internals::vlm::checkpoint::weights::Weights;
+use sdim::internals::vlm::qwen2_5::QwenVl;
+use sdim::internals::vlm::qwen2_5::config::VlmConfig;
+use sdim::internals::vlm::qwen2_5::decoder::Keep;
+use sdim::internals::vlm::qwen2_5::grid::Grid;
+use sdim::internals::vlm::qwen2_5::positions::positions;
+use sdim::internals::vlm::qwen2_5::preprocess::PreprocessorConfig;
+use sdim::settings::RopeLayout;
 use std::collections::HashMap;
 
 /// One prompt, with the rows of its images.

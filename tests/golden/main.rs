@@ -11,12 +11,12 @@ mod stages;
 
 use candle_core::{DType, Device, Tensor};
 use common::Golden;
-use sdim::vlm::checkpoint::weights::Weights;
-use sdim::vlm::qwen2_5::QwenVl;
-use sdim::vlm::qwen2_5::config::VlmConfig;
-use sdim::vlm::qwen2_5::grid::Grid;
-use sdim::vlm::qwen2_5::preprocess::{Pixels, PreprocessorConfig};
-use sdim::vlm::qwen2_5::rope::RopeLayout;
+use sdim::internals::vlm::checkpoint::weights::Weights;
+use sdim::internals::vlm::qwen2_5::QwenVl;
+use sdim::internals::vlm::qwen2_5::config::VlmConfig;
+use sdim::internals::vlm::qwen2_5::grid::Grid;
+use sdim::internals::vlm::qwen2_5::preprocess::{Pixels, PreprocessorConfig};
+use sdim::settings::RopeLayout;
 use stages::Case;
 use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};

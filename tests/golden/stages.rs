@@ -3,12 +3,12 @@
 use super::CPU;
 use super::common::{Allowed, Golden};
 use candle_core::{DType, Tensor};
-use sdim::vlm::chat::generate::GenerateOptions;
-use sdim::vlm::qwen2_5::QwenVl;
-use sdim::vlm::qwen2_5::decoder::{Context, Keep};
-use sdim::vlm::qwen2_5::grid::{Grid, WindowOrder};
-use sdim::vlm::qwen2_5::positions::{PromptPositions, positions};
-use sdim::vlm::qwen2_5::rope::{Position, RopeTable, vision_table};
+use sdim::internals::vlm::chat::generate::GenerateOptions;
+use sdim::internals::vlm::qwen2_5::QwenVl;
+use sdim::internals::vlm::qwen2_5::decoder::{Context, Keep};
+use sdim::internals::vlm::qwen2_5::grid::{Grid, WindowOrder};
+use sdim::internals::vlm::qwen2_5::positions::{PromptPositions, positions};
+use sdim::internals::vlm::qwen2_5::rope::{Position, RopeTable, vision_table};
 
 /// One prompt with its images.
 pub struct Case<'a> {

@@ -23,7 +23,7 @@ const TOP: usize = 20;
 /// A published Qwen2.5-VL checkpoint, or a fine-tune of one, to talk to. Immutable: share it by `Arc`.
 ///
 /// ```no_run
-/// use sdim::vlm::chat::{AnswerOptions, ChatModel};
+/// use sdim::chat::{AnswerOptions, ChatModel};
 /// let model = ChatModel::load("Qwen2.5-VL-3B-Instruct", &candle_core::Device::Cpu)?;
 /// let image = sdim::read_rgb("kitchen.jpg")?;
 /// let answer = model.answer(&image, "How far is the kettle?", &AnswerOptions::default())?;

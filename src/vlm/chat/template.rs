@@ -63,7 +63,7 @@ pub struct Message {
 /// A conversation that the model is to continue.
 ///
 /// ```
-/// use sdim::vlm::chat::{ChatPrompt, Part};
+/// use sdim::chat::{ChatPrompt, Part};
 /// let prompt = ChatPrompt::new().user([Part::Image, "How far is the door?".into()]);
 /// assert!(prompt.text().ends_with("<|vision_end|>How far is the door?<|im_end|>\n<|im_start|>assistant\n"));
 /// ```
