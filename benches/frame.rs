@@ -3,7 +3,7 @@
 use criterion::{Criterion, criterion_group, criterion_main};
 use sdim::depth::sample_points;
 use sdim::internals::fusion::Normalise;
-use sdim::internals::model::ask;
+use sdim::internals::model::{AskOptions, ask};
 use sdim::internals::query::Query;
 use sdim::refine::{Answered, EdgeAwareFill, Fill, FillInput};
 use sdim::scenes::procedural;
@@ -34,7 +34,7 @@ fn frame(c: &mut Criterion) {
     group.bench_function("vision", |b| b.iter(|| model.vlm.encode(&patches, &[pixels.grid])));
     group.bench_function("encode", |b| b.iter(|| model.encode(&pixels, &scattered)));
     group.bench_function("prefill", |b| b.iter(|| model.read_prefix(&pixels, &tokens, &sparse)));
-    group.bench_function("ask-4096", |b| b.iter(|| ask(model, &prefix, &queries, &mut |_| true)));
+    group.bench_function("ask-4096", |b| b.iter(|| ask(model, &prefix, &queries, AskOptions::default())));
     let asked: Vec<Answered> = (0..160 * 120)
         .map(|i| Answered {
             x: i % 160 * 4,
@@ -47,7 +47,7 @@ fn frame(c: &mut Criterion) {
     let input = FillInput { width: 640, height: 480, rgb: &frame.rgb, asked: &asked, sparse: &sparse };
     group.bench_function("fill-stride-4", |b| b.iter(|| EdgeAwareFill::default().fill(&input)));
     for plan in [QueryPlan::Stride(4), QueryPlan::Stride(2)] {
-        let options = CompleteOptions { plan, ..Default::default() };
+        let options = CompleteOptions::default().with_plan(plan);
         group.bench_function(format!("complete-{plan}"), |b| {
             b.iter(|| completer.complete(&frame.rgb, &sparse, &options));
         });

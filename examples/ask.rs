@@ -9,7 +9,7 @@ mod stdout;
 use clap::Parser;
 use sdim::chat::{AnswerOptions, ChatModel, Sampling};
 use sdim::system::device;
-use sdim::{WeightFormat, read_rgb};
+use sdim::{LoadOptions, WeightFormat, read_rgb};
 use serde_json::json;
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -40,9 +40,9 @@ struct Args {
     /// The same seed gives the same answer.
     #[arg(long, requires = "temperature", default_value_t = 0)]
     seed: u64,
-    /// How matrices are held: f32, bf16 (half the memory) or int8 (a quarter).
-    #[arg(long, default_value = "f32")]
-    dtype: WeightFormat,
+    /// How matrices are held: f32, bf16 (half the memory) or int8 (a quarter); without it, as suits the device.
+    #[arg(long)]
+    weights: Option<WeightFormat>,
     /// cpu, cuda:N or metal.
     #[arg(long, default_value = "cpu")]
     device: String,
@@ -64,17 +64,13 @@ fn checkpoint(model: &str) -> sdim::Result<PathBuf> {
 fn run(args: &Args) -> sdim::Result<String> {
     sdim::internals::kernels::keep_freed_memory();
     let image = read_rgb(&args.image)?;
-    let model = ChatModel::load_as(checkpoint(&args.model)?, &device(&args.device)?, args.dtype)?;
-    let options = AnswerOptions {
-        max_new_tokens: args.max_new_tokens,
-        repetition_penalty: args.repetition_penalty,
-        sampling: args.temperature.map(|temperature| Sampling {
-            temperature,
-            top_p: args.top_p,
-            seed: args.seed,
-        }),
-        ..Default::default()
-    };
+    let mut options = LoadOptions::on(&device(&args.device)?);
+    options.weights = args.weights.unwrap_or(options.weights);
+    let model = ChatModel::load(checkpoint(&args.model)?, &options)?;
+    let mut options = AnswerOptions::default().with_max_new_tokens(args.max_new_tokens);
+    options.repetition_penalty = args.repetition_penalty;
+    options.sampling =
+        args.temperature.map(|temperature| Sampling { temperature, top_p: args.top_p, seed: args.seed });
     let answer = model.answer(&image, &args.prompt, &options)?;
     if !args.json {
         return Ok(answer.text);

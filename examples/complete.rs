@@ -7,16 +7,15 @@ mod common;
 
 use anyhow::Context;
 use clap::Parser;
-use common::{load_as, rounded, stdout};
+use common::{load_as, load_options, rounded, stdout};
 use indicatif::{ProgressBar, ProgressStyle};
 use sdim::depth::interpolate;
 use sdim::draw::preview;
 use sdim::metrics::{Errors, errors};
-use sdim::system::{device, peak_rss_bytes};
-use sdim::{CompleteOptions, DepthScale, LoadOptions, QueryPlan, SparseDepth, WeightFormat, read_rgb};
+use sdim::system::peak_rss_bytes;
+use sdim::{CompleteOptions, DepthScale, QueryPlan, SparseDepth, WeightFormat, read_rgb};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 use std::time::Instant;
 
 #[derive(Parser)]
@@ -99,12 +98,7 @@ fn main() -> anyhow::Result<()> {
     sdim::internals::kernels::keep_freed_memory();
     let inputs = args.inputs();
     let start = Instant::now();
-    let device = device(&args.device)?;
-    let options = LoadOptions {
-        weights: args.weights.unwrap_or(WeightFormat::native(&device)),
-        adapter: args.adapter.clone(),
-        ..LoadOptions::on(&device)
-    };
+    let options = load_options(&args.device, args.weights, args.adapter.as_deref())?;
     let completer = load_as(&args.model, &options)?;
     let rgb = read_rgb(&inputs.rgb)?;
     let sparse = SparseDepth::read(&inputs.sparse, inputs.scale)?;
@@ -125,14 +119,10 @@ fn main() -> anyhow::Result<()> {
 
     let bar = bar()?;
     let ticker = bar.clone();
-    let options = CompleteOptions {
-        plan: args.plan,
-        progress: Some(Arc::new(move |p| {
-            ticker.set_length(p.planned as u64);
-            ticker.set_position(p.answered as u64);
-        })),
-        ..Default::default()
-    };
+    let options = CompleteOptions::default().with_plan(args.plan).with_progress(move |p| {
+        ticker.set_length(p.planned as u64);
+        ticker.set_position(p.answered as u64);
+    });
     let done = completer.complete_detailed(&rgb, &sparse, &options)?;
     bar.finish_and_clear();
     let scores = match &gt {

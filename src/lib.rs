@@ -23,8 +23,7 @@
 //! let completer = DepthCompleter::tiny()?; // share it between threads; clones are cheap
 //! let rgb = image::RgbImage::from_pixel(64, 48, image::Rgb([90, 120, 60]));
 //! let sparse = SparseDepth::from_points(64, 48, &[(5, 5, 2.0), (60, 8, 2.5), (30, 40, 1.2)])?; // x, y, metres
-//! let mut options = CompleteOptions::default();
-//! options.plan = QueryPlan::Stride(2);
+//! let options = CompleteOptions::default().with_plan(QueryPlan::Stride(2));
 //! let dense = completer.complete(&rgb, &sparse, &options)?;
 //! assert_eq!(dense.get(30, 40), Some(1.2));
 //! assert_eq!(dense.valid(), 64 * 48);
@@ -37,9 +36,9 @@
 //! With files and a checkpoint of one's own; the unit of an integer file must be told:
 //!
 //! ```no_run
-//! use sdim::{CompleteOptions, DepthCompleter, DepthScale, SparseDepth, read_rgb};
+//! use sdim::{CompleteOptions, DepthCompleter, DepthScale, LoadOptions, SparseDepth, read_rgb};
 //!
-//! let completer = DepthCompleter::load("checkpoint-dir", &candle_core::Device::Cpu)?;
+//! let completer = DepthCompleter::load("checkpoint-dir", &LoadOptions::default())?;
 //! let rgb = read_rgb("frame.png")?;
 //! let sparse = SparseDepth::read("lidar.png", Some(DepthScale::kitti()))?; // 16 bits, 1/256 m
 //! let dense = completer.complete(&rgb, &sparse, &CompleteOptions::default())?;
@@ -120,8 +119,9 @@ pub use complete::{
 pub use depth::{DepthMap, DepthScale, Intrinsics, SparseDepth};
 pub use error::{Error, Result};
 pub use kernels::WeightFormat;
-pub use model::{Adapter, LoadOptions};
+pub use model::Adapter;
 pub use query::QueryPlan;
+pub use vlm::checkpoint::LoadOptions;
 
 /// What `sdim.json` says: how a checkpoint is asked, and what an adapter adds to it.
 pub mod settings {

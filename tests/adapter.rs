@@ -45,15 +45,15 @@ impl Base {
     }
 
     fn load(&self, adapter: Option<&Path>, lora: LoraMode, weights: WeightFormat) -> SdimModel {
-        let adapter = adapter.map(Path::to_path_buf);
-        let options = LoadOptions { adapter, lora, weights, ..LoadOptions::default() };
-        SdimModel::load_with(self.dir.path(), &options).unwrap()
+        let mut options = LoadOptions::default().with_lora(lora).with_weights(weights);
+        options.adapter = adapter.map(Path::to_path_buf);
+        SdimModel::load(self.dir.path(), &options).unwrap()
     }
 }
 
 fn answers(model: SdimModel) -> Vec<f32> {
     let (rgb, sparse) = tiny::frame(80, 64);
-    let options = CompleteOptions { plan: QueryPlan::Every, ..CompleteOptions::default() };
+    let options = CompleteOptions::default().with_plan(QueryPlan::Every);
     let map = DepthCompleter::new(model).complete(&rgb, &sparse, &options).unwrap();
     map.depth().iter().chain(map.expected_error()).copied().collect()
 }
@@ -175,10 +175,8 @@ fn what_an_adapter_has_wrong_is_named() {
         change(&mut bad);
         let dir = tempfile::tempdir().unwrap();
         bad.save(dir.path()).unwrap();
-        let adapter = Some(dir.path().to_path_buf());
-        SdimModel::load_with(base.dir.path(), &LoadOptions { adapter, ..LoadOptions::default() })
-            .err()
-            .expect("an error")
+        let options = LoadOptions::default().with_adapter(dir.path());
+        SdimModel::load(base.dir.path(), &options).err().expect("an error")
     };
     let a = "model.layers.1.self_attn.q_proj.lora_A.weight";
     match fails(&|bad| drop(bad.tensors.remove(a))) {

@@ -6,6 +6,7 @@ use candle_core::Device;
 use common::{Golden, relative_difference};
 use sdim::Error;
 use sdim::chat::{AnswerOptions, ChatModel, ChatPrompt, Part};
+use sdim::{LoadOptions, WeightFormat};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
@@ -77,7 +78,7 @@ impl Checkpoint {
     }
 
     fn load(&self) -> Result<ChatModel, Error> {
-        ChatModel::load(self.dir.path(), &Device::Cpu)
+        ChatModel::load(self.dir.path(), &LoadOptions::default().with_weights(WeightFormat::F32))
     }
 
     fn ask(&self, args: &[&str]) -> Output {
@@ -194,7 +195,7 @@ fn first_logits_are_those_of(top: &Value, golden: &[f32]) {
 fn bf16_answers_nearly_alike() {
     let checkpoint = Checkpoint::new();
     let top = |dtype: &str| -> Vec<(u32, f32)> {
-        let out = checkpoint.ask(&["--json", "--max-new-tokens", "1", "--dtype", dtype]);
+        let out = checkpoint.ask(&["--json", "--max-new-tokens", "1", "--weights", dtype]);
         assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
         let v: Value = serde_json::from_slice(&out.stdout).unwrap();
         serde_json::from_value(v["first_logits_top"].clone()).unwrap()
@@ -224,7 +225,7 @@ fn an_answer_ends_before_a_stop_id() {
     let image = sdim::read_rgb(fixture().join(format!("image_{CASE}.png"))).unwrap();
     let golden: Vec<u32> =
         golden().integers(&format!("{CASE}.generated_ids_rp105")).iter().map(|&id| id as u32).collect();
-    let options = AnswerOptions { stop_ids: Some(vec![golden[3]]), ..Default::default() };
+    let options = AnswerOptions::default().with_stop_ids(vec![golden[3]]);
     let answer = model.answer(&image, QUESTION, &options).unwrap();
     assert_eq!(answer.generated_ids, golden[..3]);
 }
@@ -287,7 +288,7 @@ fn nobody_reading_the_answer_is_no_failure() {
 fn a_conversation_may_have_more_images_or_none() {
     let model = Checkpoint::new().load().unwrap();
     let image = sdim::read_rgb(fixture().join(format!("image_{CASE}.png"))).unwrap();
-    let options = AnswerOptions { max_new_tokens: 3, ..Default::default() };
+    let options = AnswerOptions::default().with_max_new_tokens(3);
     let two = ChatPrompt::new().user([Part::Image, Part::Image, QUESTION.into()]);
     let answer = model.reply(&two, &[&image, &image], &options).unwrap();
     assert_eq!(answer.prompt_ids.iter().filter(|&&id| id == 300).count(), 2 * 32);

@@ -5,7 +5,8 @@ mod common;
 use candle_core::{DType, Device, Tensor};
 use common::tiny::{self, Tensors};
 use sdim::Error;
-use sdim::internals::model::{SdimModel, ask};
+use sdim::LoadOptions;
+use sdim::internals::model::{AskOptions, SdimModel, ask};
 use sdim::internals::query::Query;
 use sdim::settings::Settings;
 use sdim::supervise::init::FreshFiles;
@@ -38,7 +39,7 @@ impl Checkpoint {
     }
 
     fn load(&self) -> Result<SdimModel, Error> {
-        SdimModel::load(self.dir.path(), &Device::Cpu)
+        SdimModel::load(self.dir.path(), &LoadOptions::default())
     }
 
     fn error(&self) -> Error {
@@ -335,7 +336,7 @@ fn load_and_ask(checkpoint: &Checkpoint, and_ask: bool) -> bool {
         let tokens = model.encode(&pixels, &scattered).unwrap();
         if let Ok(prefix) = model.read_prefix(&pixels, &tokens, &sparse) {
             let query = Query { x: 3, y: 4, measured: None, hint: 2.0 };
-            let _ = ask(&model, &prefix, &[query], &mut |_| true);
+            let _ = ask(&model, &prefix, &[query], AskOptions::default());
         }
     }
     true

@@ -11,7 +11,7 @@ use std::sync::{Arc, LazyLock, Mutex};
 static TINY: LazyLock<DepthCompleter> = LazyLock::new(|| DepthCompleter::tiny().unwrap());
 
 fn options(plan: QueryPlan) -> CompleteOptions {
-    CompleteOptions { plan, ..Default::default() }
+    CompleteOptions::default().with_plan(plan)
 }
 
 fn frame(points: usize) -> (RgbImage, SparseDepth, Vec<f32>) {
@@ -52,12 +52,12 @@ fn the_same_frame_gives_the_same_map() {
 #[test]
 fn preserve_ask_lets_the_model_speak_at_measured_pixels() {
     let (rgb, sparse, _) = frame(100);
-    let ask = CompleteOptions { preserve: Preserve::Ask, align: false, ..options(QueryPlan::Every) };
+    let ask = options(QueryPlan::Every).with_preserve(Preserve::Ask).with_align(false);
     let map = TINY.complete(&rgb, &sparse, &ask).unwrap();
     assert!(map.measured().iter().all(|m| !m));
     let kept = sparse.points().filter(|&(x, y, d)| map.get(x, y) == Some(d)).count();
     assert!(kept < sparse.measured());
-    let aligned = TINY.complete(&rgb, &sparse, &CompleteOptions { align: true, ..ask }).unwrap();
+    let aligned = TINY.complete(&rgb, &sparse, &ask.with_align(true)).unwrap();
     let off = |m: &DepthMap| -> f32 {
         sparse.points().map(|(x, y, d)| (m.get(x, y).unwrap_or(0.0) - d).abs()).sum()
     };
@@ -156,11 +156,9 @@ fn progress_counts_up_and_a_token_stops() {
     let seen = Arc::new(Mutex::new(Vec::new()));
     let cancel = sdim::CancelToken::default();
     let (log, token) = (seen.clone(), cancel.clone());
-    let watched = CompleteOptions {
-        progress: Some(Arc::new(move |p| log.lock().unwrap().push((p.answered, p.planned)))),
-        cancel: Some(token),
-        ..options(QueryPlan::Every)
-    };
+    let watched = options(QueryPlan::Every)
+        .with_progress(move |p| log.lock().unwrap().push((p.answered, p.planned)))
+        .with_cancel(token);
     TINY.complete(&rgb, &sparse, &watched).unwrap();
     let calls = std::mem::take(&mut *seen.lock().unwrap());
     assert!(calls.len() > 1 && calls.windows(2).all(|w| w[0].0 < w[1].0));
@@ -176,11 +174,9 @@ fn a_memory_limit_makes_smaller_batches_and_the_same_map() {
     let run = |max_memory: Option<usize>| {
         let steps = Arc::new(Mutex::new(vec![0]));
         let seen = steps.clone();
-        let options = CompleteOptions {
-            max_memory,
-            progress: Some(Arc::new(move |p| seen.lock().unwrap().push(p.answered))),
-            ..options(QueryPlan::Stride(8))
-        };
+        let mut options =
+            options(QueryPlan::Stride(8)).with_progress(move |p| seen.lock().unwrap().push(p.answered));
+        options.max_memory = max_memory;
         let map = TINY.complete(&rgb, &sparse, &options).unwrap();
         let largest = steps.lock().unwrap().windows(2).map(|s| s[1] - s[0]).max().unwrap();
         (map, largest)

@@ -7,7 +7,7 @@ use common::relative_difference;
 use common::tiny::{self, Tensors};
 use sdim::SparseDepth;
 use sdim::internals::fusion::{BatchStats, Fusion, Normalise};
-use sdim::internals::model::{SdimModel, ask};
+use sdim::internals::model::{AskOptions, SdimModel, ask};
 use sdim::internals::query::Query;
 use sdim::internals::vlm::checkpoint::weights::Weights;
 use sdim::settings::{FusionConfig, Settings};
@@ -53,7 +53,7 @@ fn run(model: &SdimModel, sparse: &SparseDepth) -> (Vec<u32>, Vec<u32>) {
     let prefix = model.read_prefix(&pixels, &tokens, sparse).unwrap();
     let queries: Vec<Query> =
         (0..20).map(|i| Query { x: i * 4, y: i * 3, measured: None, hint: 2.0 }).collect();
-    let readings = ask(model, &prefix, &queries, &mut |_| true).unwrap();
+    let readings = ask(model, &prefix, &queries, AskOptions::default()).unwrap();
     let tokens: Vec<f32> = tokens.flatten_all().unwrap().to_vec1().unwrap();
     let readings = readings.iter().flat_map(|r| [r.value, r.confidence, r.expected_error]);
     (tokens.iter().map(|v| v.to_bits()).collect(), readings.map(f32::to_bits).collect())

@@ -7,6 +7,7 @@ mod common;
 
 use candle_core::Device;
 use sdim::Error;
+use sdim::LoadOptions;
 use sdim::hub::Hub;
 use sdim::internals::model::SdimModel;
 use sdim::settings::Settings;
@@ -98,7 +99,7 @@ fn a_complete_snapshot_needs_no_network() {
             assert_eq!(hub.checkpoint(REPOSITORY, None).unwrap(), snapshot);
             assert_eq!(hub.checkpoint(REPOSITORY, Some(COMMIT)).unwrap(), snapshot);
         }
-        SdimModel::load(&snapshot, &Device::Cpu).unwrap();
+        SdimModel::load(&snapshot, &LoadOptions::default()).unwrap();
     }
 }
 
@@ -253,7 +254,7 @@ fn only_what_is_needed_is_fetched_and_only_once() {
     }
     let authorised = |(_, token): &(String, Option<String>)| token.as_deref() == Some("Bearer hf_x");
     assert!(server.state.seen.lock().unwrap().iter().all(authorised));
-    SdimModel::load(&snapshot, &Device::Cpu).unwrap();
+    SdimModel::load(&snapshot, &LoadOptions::default()).unwrap();
 
     let requests = server.state.seen.lock().unwrap().len();
     assert_eq!(hub.checkpoint(REPOSITORY, None).unwrap(), snapshot);
@@ -276,7 +277,7 @@ fn a_repository_of_newer_versions_is_complete() {
     let dir = tempfile::tempdir().unwrap();
     let snapshot = server.hub(dir.path()).checkpoint(REPOSITORY, None).unwrap();
     assert_eq!(server.asked(), files.keys().cloned().collect::<Vec<_>>());
-    SdimModel::load(&snapshot, &Device::Cpu).unwrap();
+    SdimModel::load(&snapshot, &LoadOptions::default()).unwrap();
     assert_eq!(offline(dir.path()).checkpoint(REPOSITORY, None).unwrap(), snapshot);
 }
 

@@ -2,6 +2,7 @@
 
 use candle_core::{DType, Device, Tensor};
 use sdim::Error;
+use sdim::LoadOptions;
 use sdim::internals::model::SdimModel;
 use sdim::settings::Settings;
 use sdim::supervise::{TrainConfig, Trainer};
@@ -44,7 +45,7 @@ fn index(dir: &Path) -> Value {
 fn shards_hold_the_same_model() {
     let dir = tempfile::tempdir().unwrap();
     let (whole, cut) = checkpoints(dir.path());
-    let [a, b] = [&whole, &cut].map(|d| SdimModel::load(d, &Device::Cpu).unwrap());
+    let [a, b] = [&whole, &cut].map(|d| SdimModel::load(d, &LoadOptions::default()).unwrap());
     let ids: Vec<u32> = (0..300).collect();
     let rows = |m: &SdimModel| -> Vec<f32> {
         m.vlm.decoder.embed(&ids).unwrap().flatten_all().unwrap().to_vec1().unwrap()
@@ -58,7 +59,7 @@ fn a_wrong_index_or_shard_is_named() {
     let (_, cut) = checkpoints(dir.path());
     let map = index(&cut);
     let says = |needle: &str| {
-        let error = SdimModel::load(&cut, &Device::Cpu).err().expect("an error");
+        let error = SdimModel::load(&cut, &LoadOptions::default()).err().expect("an error");
         assert!(error.to_string().contains(needle), "{error}");
         error
     };

@@ -7,7 +7,7 @@ use common::{close, relative_difference, tiny};
 use image::RgbImage;
 use sdim::SparseDepth;
 use sdim::internals::kernels::Block;
-use sdim::internals::model::{Prefix, SdimModel, ask};
+use sdim::internals::model::{AskOptions, Prefix, SdimModel, ask};
 use sdim::internals::query::Query;
 use sdim::internals::query::number::{DigitReader, Reading, read_bins};
 use sdim::internals::query::prompt::Tokens;
@@ -157,7 +157,7 @@ impl Setup {
     }
 
     fn ask(&self, queries: &[Query]) -> Vec<Reading> {
-        ask(&self.model, &self.prefix, queries, &mut |_| true).unwrap()
+        ask(&self.model, &self.prefix, queries, AskOptions::default()).unwrap()
     }
 
     /// Batches of several sizes and orders against each query alone.

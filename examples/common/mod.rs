@@ -3,13 +3,26 @@
 
 pub mod stdout;
 
-use sdim::{DepthCompleter, LoadOptions};
+use sdim::{DepthCompleter, LoadOptions, WeightFormat};
+use std::path::Path;
+
+/// What `--device`, `--weights` and `--adapter` say.
+pub fn load_options(
+    device: &str,
+    weights: Option<WeightFormat>,
+    adapter: Option<&Path>,
+) -> sdim::Result<LoadOptions> {
+    let mut options = LoadOptions::on(&sdim::system::device(device)?);
+    options.weights = weights.unwrap_or(options.weights);
+    options.adapter = adapter.map(Path::to_path_buf);
+    Ok(options)
+}
 
 /// Loads `tiny` or a checkpoint directory.
 pub fn load_as(model: &str, options: &LoadOptions) -> anyhow::Result<DepthCompleter> {
     Ok(match model {
         "tiny" => DepthCompleter::tiny_with(options)?,
-        dir => DepthCompleter::load_with(dir, options)?,
+        dir => DepthCompleter::load(dir, options)?,
     })
 }
 

@@ -11,12 +11,9 @@ const HELD_OUT: u64 = 2_000_000;
 pub fn open(args: &Args) -> anyhow::Result<Box<dyn Dataset>> {
     match (&args.data, args.procedural) {
         (Some(dir), _) => {
-            let options = LayoutOptions {
-                scale: args.depth_scale,
-                seed: args.seed,
-                range: args.range,
-                frames: args.frame_list.clone(),
-            };
+            let mut options = LayoutOptions::default().with_seed(args.seed);
+            (options.scale, options.range) = (args.depth_scale, args.range);
+            options.frames = args.frame_list.clone();
             Ok(args.layout.open(dir, &options)?)
         }
         (None, Some(0) | None) => anyhow::bail!("--procedural 0: expected at least 1 scene"),

@@ -183,12 +183,7 @@ fn pair(text: &str) -> Result<(f32, f32), String> {
 impl Args {
     /// How checkpoints are loaded.
     fn options(&self) -> sdim::Result<LoadOptions> {
-        let device = sdim::system::device(&self.device)?;
-        Ok(LoadOptions {
-            weights: self.weights.unwrap_or(WeightFormat::native(&device)),
-            adapter: self.adapter.clone(),
-            ..LoadOptions::on(&device)
-        })
+        common::load_options(&self.device, self.weights, self.adapter.as_deref())
     }
 
     /// Numbers of points to draw; 0 alone where nothing is drawn, since all frames have their own.

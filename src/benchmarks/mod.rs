@@ -19,6 +19,7 @@ mod listing;
 mod lzf;
 mod mat;
 mod nyu;
+#[doc(hidden)]
 pub mod outliers;
 mod parts;
 mod scannet;
@@ -149,6 +150,7 @@ pub enum Layout {
 
 /// What may be chosen when a data set is opened.
 #[derive(Clone, Debug, Default, PartialEq)]
+#[non_exhaustive]
 pub struct LayoutOptions {
     /// Unit of the integer files of [`Layout::Folder`]. The other layouts have a unit of their own and refuse another.
     pub scale: Option<DepthScale>,
@@ -162,6 +164,32 @@ pub struct LayoutOptions {
     /// [`Dataset::name`], or `SCENE/NUMBER` as in the published lists of ScanNet's frames, with or without zeros before the
     /// number. `None`: all frames.
     pub frames: Option<PathBuf>,
+}
+
+impl LayoutOptions {
+    /// With this unit of integer files.
+    pub fn with_scale(mut self, scale: DepthScale) -> Self {
+        self.scale = Some(scale);
+        self
+    }
+
+    /// With this seed of drawn measurements.
+    pub fn with_seed(mut self, seed: u64) -> Self {
+        self.seed = seed;
+        self
+    }
+
+    /// With ground truth between these depths alone, metres.
+    pub fn with_range(mut self, nearest: f32, farthest: f32) -> Self {
+        self.range = Some((nearest, farthest));
+        self
+    }
+
+    /// With the frames that this text file names.
+    pub fn with_frames(mut self, list: impl Into<PathBuf>) -> Self {
+        self.frames = Some(list.into());
+        self
+    }
 }
 
 impl Layout {

@@ -7,9 +7,9 @@ pub use options::{CancelToken, CompleteOptions, Preserve, Progress, ProgressCall
 
 use crate::depth::{DepthMap, SparseDepth};
 use crate::error::{Error, Result};
-use crate::model::{LoadOptions, SdimModel};
+use crate::model::SdimModel;
+use crate::vlm::checkpoint::LoadOptions;
 use crate::vlm::qwen2_5::preprocess::MAX_RATIO;
-use candle_core::Device;
 use image::RgbImage;
 use questions::Questions;
 use std::path::Path;
@@ -52,25 +52,16 @@ pub struct DepthCompleter {
 }
 
 impl DepthCompleter {
-    /// The small checkpoint that ships inside the crate (feature `tiny`), on the CPU.
+    /// The small checkpoint that ships inside the crate (feature `tiny`), on the CPU, in the format of weights that suits it.
     ///
     /// # Errors
     /// None in practice: the embedded files are covered by tests.
     #[cfg(feature = "tiny")]
     pub fn tiny() -> Result<Self> {
-        Self::tiny_on(&Device::Cpu)
+        Self::tiny_with(&LoadOptions::default())
     }
 
-    /// As [`DepthCompleter::tiny`], on another device.
-    ///
-    /// # Errors
-    /// [`Error::Tensors`] if the device refuses the tensors.
-    #[cfg(feature = "tiny")]
-    pub fn tiny_on(device: &Device) -> Result<Self> {
-        Self::tiny_with(&LoadOptions::on(device))
-    }
-
-    /// As [`DepthCompleter::tiny`], with a form of weights and an adapter.
+    /// As [`DepthCompleter::tiny`], on another device, with another format of weights or an adapter.
     ///
     /// # Errors
     /// [`Error::Tensors`] if the device refuses the tensors; what an adapter can have wrong.
@@ -79,28 +70,23 @@ impl DepthCompleter {
         Ok(Self::new(crate::model::tiny(options)?))
     }
 
-    /// Loads a checkpoint directory onto a device.
+    /// Loads a checkpoint directory: the published files of Qwen2.5-VL (`config.json`, `preprocessor_config.json`,
+    /// `tokenizer.json`, `model.safetensors` or its shards with their index), and `sdim.json` and `sdim.safetensors` if it has them.
     ///
     /// # Errors
-    /// As [`SdimModel::load`].
-    pub fn load(dir: impl AsRef<Path>, device: &Device) -> Result<Self> {
-        Ok(Self::new(SdimModel::load(dir.as_ref(), device)?))
-    }
-
-    /// Loads a checkpoint directory with a form of weights and an adapter.
-    ///
-    /// # Errors
-    /// As [`SdimModel::load_with`].
-    pub fn load_with(dir: impl AsRef<Path>, options: &LoadOptions) -> Result<Self> {
-        Ok(Self::new(SdimModel::load_with(dir.as_ref(), options)?))
+    /// Typed errors that name the file, key or tensor.
+    pub fn load(dir: impl AsRef<Path>, options: &LoadOptions) -> Result<Self> {
+        Ok(Self::new(SdimModel::load(dir.as_ref(), options)?))
     }
 
     /// Wraps a model.
+    #[doc(hidden)]
     pub fn new(model: SdimModel) -> Self {
         Self { model: Arc::new(model) }
     }
 
     /// The model.
+    #[doc(hidden)]
     pub fn model(&self) -> &SdimModel {
         &self.model
     }

@@ -45,7 +45,14 @@ impl CancelToken {
 pub type ProgressCallback = Arc<dyn Fn(Progress) + Send + Sync>;
 
 /// How to complete a frame.
+///
+/// ```
+/// use sdim::{CompleteOptions, QueryPlan};
+/// let options = CompleteOptions::default().with_plan(QueryPlan::Budget(4000)).with_max_memory(64 << 20);
+/// assert_eq!(options.plan, QueryPlan::Budget(4000));
+/// ```
 #[derive(Clone)]
+#[non_exhaustive]
 pub struct CompleteOptions {
     /// Which pixels to ask.
     pub plan: QueryPlan,
@@ -91,5 +98,55 @@ impl std::fmt::Debug for CompleteOptions {
             .field("align", &self.align)
             .field("max_memory", &self.max_memory)
             .finish_non_exhaustive()
+    }
+}
+
+impl CompleteOptions {
+    /// With this plan of pixels to ask.
+    pub fn with_plan(mut self, plan: QueryPlan) -> Self {
+        self.plan = plan;
+        self
+    }
+
+    /// With measured pixels kept or asked.
+    pub fn with_preserve(mut self, preserve: Preserve) -> Self {
+        self.preserve = preserve;
+        self
+    }
+
+    /// With answers got this way.
+    pub fn with_answer(mut self, answer: AnswerMode) -> Self {
+        self.answer = Some(answer);
+        self
+    }
+
+    /// With or without the alignment to the measurements.
+    pub fn with_align(mut self, align: bool) -> Self {
+        self.align = align;
+        self
+    }
+
+    /// With batches of queries that take about this many bytes.
+    pub fn with_max_memory(mut self, bytes: usize) -> Self {
+        self.max_memory = Some(bytes);
+        self
+    }
+
+    /// With another way to fill what was not asked.
+    pub fn with_fill(mut self, fill: impl Fill + 'static) -> Self {
+        self.fill = Arc::new(fill);
+        self
+    }
+
+    /// With a function that is called after each batch.
+    pub fn with_progress(mut self, progress: impl Fn(Progress) + Send + Sync + 'static) -> Self {
+        self.progress = Some(Arc::new(progress));
+        self
+    }
+
+    /// With a token that stops the call.
+    pub fn with_cancel(mut self, cancel: CancelToken) -> Self {
+        self.cancel = Some(cancel);
+        self
     }
 }

@@ -5,7 +5,7 @@ use super::options::{CancelToken, CompleteOptions, Preserve, Progress};
 use crate::depth::interpolate::Interpolator;
 use crate::depth::{DepthMap, SparseDepth};
 use crate::error::Result;
-use crate::model::{Prefix, SdimModel, ask_within};
+use crate::model::{AskOptions, Prefix, SdimModel, ask};
 use crate::query::plan::{Asked, lattice, refine_pixels, stride_within};
 use crate::query::prompt::choose_evenly;
 use crate::query::{Hint, Query, QueryPlan, Reading};
@@ -70,14 +70,15 @@ impl<'a> Questions<'a> {
         planned: usize,
     ) -> Result<Vec<Reading>> {
         let queries: Vec<Query> = pixels.iter().map(|&p| self.query(p, tell)).collect();
-        let mode = self.options.answer.as_ref().unwrap_or(&self.model.prompts.settings().answer_mode);
-        let limit = self.options.max_memory;
-        ask_within(self.model, self.prefix, &queries, mode, limit, &mut |answered| {
+        let mut progress = |answered| {
             if let Some(callback) = &self.options.progress {
                 callback(Progress { answered: before + answered, planned });
             }
             !self.options.cancel.as_ref().is_some_and(CancelToken::is_cancelled)
-        })
+        };
+        let (mode, max_memory) = (self.options.answer.as_ref(), self.options.max_memory);
+        let options = AskOptions { mode, max_memory, progress: Some(&mut progress) };
+        ask(self.model, self.prefix, &queries, options)
     }
 
     /// Asks the plan's pixels and those of the alignment.

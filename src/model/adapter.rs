@@ -54,6 +54,7 @@ impl Adapter {
     ///
     /// # Errors
     /// [`Error::Config`] if settings are out of range; [`Error::Argument`] if a LoRA target names no layer of the model.
+    #[doc(hidden)]
     pub fn layout(config: &VlmConfig, settings: &Settings) -> Result<BTreeMap<String, Vec<usize>>> {
         settings.validate(SETTINGS)?;
         let weights =
@@ -76,6 +77,7 @@ impl Adapter {
     /// # Errors
     /// As [`Adapter::layout`].
     #[cfg(feature = "train")]
+    #[doc(hidden)]
     pub fn fresh(config: &VlmConfig, settings: Settings, seed: u64) -> Result<Self> {
         let layout = Self::layout(config, &settings)?;
         let tensors = crate::supervise::init::initial(&layout, &[], config.text.layers, seed)?;

@@ -20,53 +20,36 @@ const ROWS: usize = 2048;
 /// Queries whose prompts are written at a time, so that memory does not grow with their number.
 const CHUNK: usize = 8 * ROWS;
 
-/// Asks all queries in the checkpoint's own answer mode and returns one reading each, in metres, in their order.
+/// How queries are asked.
+#[derive(Default)]
+pub struct AskOptions<'a> {
+    /// How answers are got; `None` for the checkpoint's own way.
+    pub mode: Option<&'a AnswerMode>,
+    /// Bytes that a batch may take beside the weights and the prefix, about; at the least one query is asked at a time. The
+    /// answers are the same for any limit.
+    pub max_memory: Option<usize>,
+    /// Called with the number of answered queries after each batch; it returns false to stop.
+    pub progress: Option<&'a mut dyn FnMut(usize) -> bool>,
+}
+
+/// Asks all queries and returns one reading each, in metres, in their order.
 ///
-/// Queries do not see each other: the result of each is that of asking it alone. `progress` is called with the number
-/// of answered queries after each batch; it returns false to stop.
+/// Queries do not see each other: the result of each is that of asking it alone.
 ///
 /// # Errors
 /// [`crate::Error::Cancelled`] if `progress` said so; [`crate::Error::Argument`] if the prefix was not read for the
-/// checkpoint's pixel reference; tensor and tokenizer errors.
+/// checkpoint's pixel reference; [`crate::Error::Config`] if the mode does not go with the checkpoint; tensor and tokenizer errors.
 pub fn ask(
     model: &SdimModel,
     prefix: &Prefix,
     queries: &[Query],
-    progress: &mut dyn FnMut(usize) -> bool,
-) -> Result<Vec<Reading>> {
-    ask_as(model, prefix, queries, &model.prompts.settings().answer_mode, progress)
-}
-
-/// As [`ask`], in a given answer mode.
-///
-/// # Errors
-/// As [`ask`], and [`crate::Error::Config`] if the mode does not go with the checkpoint.
-pub fn ask_as(
-    model: &SdimModel,
-    prefix: &Prefix,
-    queries: &[Query],
-    mode: &AnswerMode,
-    progress: &mut dyn FnMut(usize) -> bool,
-) -> Result<Vec<Reading>> {
-    ask_within(model, prefix, queries, mode, None, progress)
-}
-
-/// As [`ask_as`], in batches that take about `max_memory` bytes beside the weights and the prefix, at the least one query
-/// at a time. The answers are the same for any limit.
-///
-/// # Errors
-/// As [`ask_as`].
-pub fn ask_within(
-    model: &SdimModel,
-    prefix: &Prefix,
-    queries: &[Query],
-    mode: &AnswerMode,
-    max_memory: Option<usize>,
-    progress: &mut dyn FnMut(usize) -> bool,
+    options: AskOptions,
 ) -> Result<Vec<Reading>> {
     let unit = prefix.space.unit;
-    let rows = rows_within(model, max_memory);
-    match mode {
+    let rows = rows_within(model, options.max_memory);
+    let mut on = |_: usize| true;
+    let progress = options.progress.unwrap_or(&mut on);
+    match options.mode.unwrap_or(&model.prompts.settings().answer_mode) {
         AnswerMode::Digits => {
             let plan = Plan { forced: true, room: 0, rows };
             in_batches(model, prefix, queries, plan, progress, Reading::INVALID, &mut |mut batch| {
@@ -97,7 +80,7 @@ fn rows_within(model: &SdimModel, max_memory: Option<usize>) -> usize {
 /// Lets the model answer each query freely, token by token, and returns what it said, in the order of the queries.
 ///
 /// # Errors
-/// As [`ask_as`].
+/// As [`ask`].
 pub fn generate(
     model: &SdimModel,
     prefix: &Prefix,

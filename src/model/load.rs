@@ -3,61 +3,18 @@
 use super::files::{CheckpointFiles, SETTINGS, TENSORS};
 use super::sdim_model::SdimModel;
 use crate::error::Result;
-use crate::kernels::WeightFormat;
 use crate::query::Settings;
-use crate::vlm::checkpoint::lora::LoraMode;
+use crate::vlm::checkpoint::LoadOptions;
 use crate::vlm::checkpoint::weights::Weights;
-use candle_core::Device;
-use std::path::{Path, PathBuf};
-
-/// How to load a checkpoint.
-#[derive(Debug, Clone)]
-pub struct LoadOptions {
-    /// Where its tensors shall lie.
-    pub device: Device,
-    /// In what form its matrices are kept. On the CPU, [`WeightFormat::Bf16`] takes half the memory of
-    /// [`WeightFormat::F32`] and is faster; a published checkpoint loses nothing by it, since it is stored in bf16.
-    pub weights: WeightFormat,
-    /// A directory with `sdim.json` and `sdim.safetensors`, which replace or complete those of the checkpoint.
-    pub adapter: Option<PathBuf>,
-    /// What becomes of the adapter's LoRA factors.
-    pub lora: LoraMode,
-}
-
-impl LoadOptions {
-    /// A device, the form of weights that suits it ([`WeightFormat::native`]), no adapter.
-    pub fn on(device: &Device) -> Self {
-        Self {
-            device: device.clone(),
-            weights: WeightFormat::native(device),
-            adapter: None,
-            lora: LoraMode::default(),
-        }
-    }
-}
-
-impl Default for LoadOptions {
-    /// As [`LoadOptions::on`] the CPU.
-    fn default() -> Self {
-        Self::on(&Device::Cpu)
-    }
-}
+use std::path::Path;
 
 impl SdimModel {
-    /// Loads a checkpoint directory in the form that suits the device ([`LoadOptions::on`]): `config.json`, `preprocessor_config.json`, `tokenizer.json`,
-    /// `model.safetensors` or its shards with their index, and `sdim.json` and `sdim.safetensors` if it has them.
+    /// Loads a checkpoint directory: `config.json`, `preprocessor_config.json`, `tokenizer.json`, `model.safetensors` or its
+    /// shards with their index, and `sdim.json` and `sdim.safetensors` if it has them.
     ///
     /// # Errors
     /// Typed errors that name the file, key or tensor.
-    pub fn load(dir: &Path, device: &Device) -> Result<Self> {
-        Self::load_with(dir, &LoadOptions::on(device))
-    }
-
-    /// As [`SdimModel::load`], with a form of weights and an adapter.
-    ///
-    /// # Errors
-    /// Typed errors that name the file, key or tensor.
-    pub fn load_with(dir: &Path, options: &LoadOptions) -> Result<Self> {
+    pub fn load(dir: &Path, options: &LoadOptions) -> Result<Self> {
         let files = CheckpointFiles::from_dir(dir)?;
         let mut weights = Weights::from_dir(dir, &options.device)?;
         let beside = dir.join(TENSORS);

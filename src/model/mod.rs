@@ -15,11 +15,10 @@ mod prefix;
 mod sdim_model;
 
 pub use adapter::Adapter;
-pub use ask::{ask, ask_as, ask_within, generate};
+pub use ask::{AskOptions, ask, generate};
 pub use encode::scatter;
 pub use files::{CheckpointFiles, SETTINGS, TENSORS};
 pub use generate::Spoken;
-pub use load::LoadOptions;
 #[cfg(feature = "tiny")]
 pub use load::tiny;
 pub use parts::DepthInjection;

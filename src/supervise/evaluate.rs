@@ -3,7 +3,7 @@
 use super::batch::mix;
 use crate::depth::{interpolate, sample_points};
 use crate::error::Result;
-use crate::model::{SdimModel, ask};
+use crate::model::{AskOptions, SdimModel, ask};
 use crate::query::Query;
 use crate::scenes::procedural;
 use rand::Rng;
@@ -45,7 +45,7 @@ pub fn evaluate(model: &SdimModel, scenes: u64, points: usize, first_seed: u64) 
         let (pixels, scattered) = model.preprocess(&frame.rgb, &sparse)?;
         let tokens = model.encode(&pixels, &scattered)?;
         let prefix = model.read_prefix(&pixels, &tokens, &sparse)?;
-        let answers = ask(model, &prefix, &queries, &mut |_| true)?;
+        let answers = ask(model, &prefix, &queries, AskOptions::default())?;
         let (mut off, mut off_linear, mut depth) = (0.0, 0.0, 0.0);
         for (q, a) in queries.iter().zip(answers) {
             let truth = frame.depth[q.y * 256 + q.x];

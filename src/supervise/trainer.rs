@@ -158,6 +158,7 @@ impl Trainer {
     ///
     /// # Errors
     /// [`Error::Tensors`] if a tensor cannot be copied.
+    #[doc(hidden)]
     pub fn averaged_model(&self) -> Result<SdimModel> {
         let tensors = self.parameters.averages()?.into_iter().collect();
         let weights = Weights::from_tensors("average", tensors);

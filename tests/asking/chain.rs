@@ -3,7 +3,7 @@
 use crate::common::{beside, close, tiny};
 use crate::setup::{DISC, Setup, by_coordinates, by_marker};
 use candle_core::{Device, Tensor};
-use sdim::internals::model::{SdimModel, ask, ask_as, generate};
+use sdim::internals::model::{AskOptions, SdimModel, ask, generate};
 use sdim::internals::query::Query;
 use sdim::internals::vlm::chat::tokenizer::Tokenizer;
 use sdim::settings::{
@@ -66,8 +66,14 @@ fn forced_and_free_answers_agree_where_the_words_are_the_same() {
         let setup = Setup::of(chain(&for_chain(reference)));
         let queries = setup.queries(60);
         let mode = AnswerMode::Generate(Generation { max_new_tokens: 8, ..Generation::default() });
-        let free = ask_as(&setup.model, &setup.prefix, &queries, &mode, &mut |_| true).unwrap();
-        let forced = ask(&setup.model, &setup.prefix, &queries, &mut |_| true).unwrap();
+        let free = ask(
+            &setup.model,
+            &setup.prefix,
+            &queries,
+            AskOptions { mode: Some(&mode), ..Default::default() },
+        )
+        .unwrap();
+        let forced = ask(&setup.model, &setup.prefix, &queries, AskOptions::default()).unwrap();
         let (mut measured, mut open) = (0, 0);
         for ((query, free), forced) in queries.iter().zip(&free).zip(&forced) {
             assert!((forced.value - 4.25).abs() < 1e-6);
@@ -84,7 +90,9 @@ fn forced_and_free_answers_agree_where_the_words_are_the_same() {
         assert!(measured > 0 && open > 0);
         // Cut before its unit, an answer is none.
         let cut = AnswerMode::Generate(Generation { max_new_tokens: 6, ..Generation::default() });
-        let cut = ask_as(&setup.model, &setup.prefix, &queries, &cut, &mut |_| true).unwrap();
+        let cut =
+            ask(&setup.model, &setup.prefix, &queries, AskOptions { mode: Some(&cut), ..Default::default() })
+                .unwrap();
         for (query, reading) in queries.iter().zip(cut) {
             assert_eq!(reading.value.is_nan(), query.measured.is_none());
         }
@@ -99,8 +107,8 @@ fn a_frame_is_completed_by_every_way_of_asking() {
         let (rgb, sparse) = tiny::frame(90, 70);
         let free = AnswerMode::Generate(Generation::default());
         for answer in [None, Some(AnswerMode::Digits), Some(free)] {
-            let options =
-                CompleteOptions { plan: QueryPlan::Stride(16), align: false, answer, ..Default::default() };
+            let mut options = CompleteOptions::default().with_plan(QueryPlan::Stride(16)).with_align(false);
+            options.answer = answer;
             let map = completer.complete(&rgb, &sparse, &options).unwrap();
             assert!(map.keeps(&sparse) && map.valid() == 90 * 70);
             let asked = map.get(3, 3).unwrap();
@@ -113,8 +121,7 @@ fn a_frame_is_completed_by_every_way_of_asking() {
 fn what_does_not_go_together_is_refused() {
     let (rgb, sparse) = tiny::frame(90, 70);
     let tiny_completer = DepthCompleter::tiny().unwrap();
-    let options =
-        CompleteOptions { answer: Some(AnswerMode::Generate(Generation::default())), ..Default::default() };
+    let options = CompleteOptions::default().with_answer(AnswerMode::Generate(Generation::default()));
     let error = tiny_completer.complete(&rgb, &sparse, &options).unwrap_err();
     assert!(matches!(&error, Error::Config { key, .. } if key == "answer_mode.kind"), "{error}");
 
@@ -129,15 +136,20 @@ fn what_does_not_go_together_is_refused() {
     let tokens = model.encode(&pixels, &scattered).unwrap();
     let prefix = model.read_prefix(&pixels, &tokens, &sparse).unwrap();
     let query = Query { x: 1, y: 1, measured: None, hint: 1.0 };
-    let error = ask(&model, &prefix, &[query], &mut |_| true).unwrap_err();
+    let error = ask(&model, &prefix, &[query], AskOptions::default()).unwrap_err();
     assert!(matches!(error, Error::Argument { name: "prefix", .. }), "{error}");
 
     let setup = Setup::of(chain(&for_chain(PixelReference::Coordinates)));
     let unknown = Generation { stop: Some(vec!["<|no such|>".into()]), ..Generation::default() };
     let error = generate(&setup.model, &setup.prefix, &[query], &unknown, &mut |_| true).unwrap_err();
     assert!(matches!(error, Error::Tokenizer(_)), "{error}");
-    let error =
-        ask_as(&setup.model, &setup.prefix, &[query], &AnswerMode::Digits, &mut |_| false).unwrap_err();
+    let error = ask(
+        &setup.model,
+        &setup.prefix,
+        &[query],
+        AskOptions { mode: Some(&AnswerMode::Digits), progress: Some(&mut |_| false), ..Default::default() },
+    )
+    .unwrap_err();
     assert!(matches!(error, Error::Cancelled));
 }
 

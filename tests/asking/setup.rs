@@ -4,7 +4,7 @@ use crate::common::tiny;
 use candle_core::Tensor;
 use image::RgbImage;
 use sdim::SparseDepth;
-use sdim::internals::model::{Prefix, SdimModel, Spoken, ask_as, generate};
+use sdim::internals::model::{AskOptions, Prefix, SdimModel, Spoken, ask, generate};
 use sdim::internals::query::number::DigitReader;
 use sdim::internals::query::{Query, Reading};
 use sdim::internals::vlm::qwen2_5::decoder::Keep;
@@ -150,6 +150,12 @@ impl Setup {
     }
 
     pub fn digits(&self, queries: &[Query]) -> Vec<Reading> {
-        ask_as(&self.model, &self.prefix, queries, &AnswerMode::Digits, &mut |_| true).unwrap()
+        ask(
+            &self.model,
+            &self.prefix,
+            queries,
+            AskOptions { mode: Some(&AnswerMode::Digits), ..Default::default() },
+        )
+        .unwrap()
     }
 }

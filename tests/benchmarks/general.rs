@@ -27,7 +27,7 @@ fn layouts_have_names_and_protocols() {
 #[test]
 fn options_that_do_not_fit_are_refused() {
     let dir = kitti();
-    let mut options = LayoutOptions { scale: Some(DepthScale::millimetres()), ..Default::default() };
+    let mut options = LayoutOptions::default().with_scale(DepthScale::millimetres());
     let error = Layout::Kitti.open(dir.path(), &options).map(|_| ()).unwrap_err().to_string();
     assert!(error.contains("depth scale") && error.contains("kitti"), "{error}");
     options.scale = None;
@@ -40,7 +40,7 @@ fn options_that_do_not_fit_are_refused() {
 #[test]
 fn a_range_takes_away_ground_truth_and_nothing_else() {
     let dir = kitti();
-    let options = LayoutOptions { range: Some((4.5, 5.5)), ..Default::default() };
+    let options = LayoutOptions::default().with_range(4.5, 5.5);
     let whole = all(Layout::Kitti, dir.path()).unwrap().remove(0);
     let set = Layout::Kitti.open(dir.path(), &options).unwrap();
     let part = set.load(0).unwrap();
@@ -59,7 +59,7 @@ fn a_list_chooses_frames_in_its_order() {
         scannet(&dir.path().join(scene));
     }
     let list = dir.path().join("split.txt");
-    let options = LayoutOptions { frames: Some(list.clone()), ..Default::default() };
+    let options = LayoutOptions::default().with_frames(&list);
     let open = |names: &str| {
         fs::write(&list, names).unwrap();
         Layout::ScanNet.open(dir.path(), &options)
@@ -97,7 +97,7 @@ fn a_list_chooses_frames_in_its_order() {
     npy::write_npy(dir.path().join("sparse/7.npy"), 16, 12, &[1.0; 192]).unwrap();
     let list = dir.path().join("list.txt");
     fs::write(&list, "7\n07\n008").unwrap();
-    let options = LayoutOptions { frames: Some(list.clone()), ..Default::default() };
+    let options = LayoutOptions::default().with_frames(&list);
     let set = Layout::Folder.open(dir.path(), &options).unwrap();
     assert_eq!([0, 1, 2].map(|i| set.name(i)), ["7", "07", "8"]);
     assert_eq!([0, 1, 2, 3].map(|i| set.has_measurements(i)), [true, false, false, false]);

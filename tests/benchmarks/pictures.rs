@@ -54,7 +54,7 @@ fn ddad_takes_the_published_hints_or_a_fifth() {
     depth(dir.path().join("pregenerated/val/gt/0000000001.png"), |_, _| 0);
     let empty = all(Layout::Ddad, dir.path()).unwrap().remove(1);
     assert!(empty.gt.iter().all(|d| d.is_nan()) && points(&empty).is_empty());
-    let options = LayoutOptions { seed: 1, ..Default::default() };
+    let options = LayoutOptions::default().with_seed(1);
     let other = Layout::Ddad.open(dir.path(), &options).unwrap();
     assert_eq!(points(&other.load(0).unwrap()).len(), 39);
     assert_ne!(points(&other.load(0).unwrap()), points(&drawn[0]));
@@ -80,7 +80,7 @@ fn void_keeps_valid_measurements() {
     assert_eq!(points(&samples[0]), expected);
     assert_eq!((samples[0].gt[8], samples[0].gt[0].is_nan()), (6.25, true));
     // VOID's own convention.
-    let options = LayoutOptions { range: Some((0.2, 5.0)), ..Default::default() };
+    let options = LayoutOptions::default().with_range(0.2, 5.0);
     let near = Layout::Void.open(dir.path().join("void_150"), &options).unwrap().load(0).unwrap();
     assert_eq!((near.gt[6], near.gt[8].is_nan()), (4.6875, true));
 }

@@ -4,7 +4,7 @@ use super::generate::{GenerateOptions, GenerationConfig, Sampling};
 use super::template::{ChatPrompt, IMAGE_PLACEHOLDER, Part};
 use super::tokenizer::Tokenizer;
 use crate::error::{Error, Result};
-use crate::kernels::WeightFormat;
+use crate::vlm::checkpoint::LoadOptions;
 use crate::vlm::checkpoint::weights::Weights;
 use crate::vlm::files::{Source, TOKENIZER, check_patches};
 use crate::vlm::qwen2_5::QwenVl;
@@ -23,8 +23,9 @@ const TOP: usize = 20;
 /// A published Qwen2.5-VL checkpoint, or a fine-tune of one, to talk to. Immutable: share it by `Arc`.
 ///
 /// ```no_run
+/// use sdim::LoadOptions;
 /// use sdim::chat::{AnswerOptions, ChatModel};
-/// let model = ChatModel::load("Qwen2.5-VL-3B-Instruct", &candle_core::Device::Cpu)?;
+/// let model = ChatModel::load("Qwen2.5-VL-3B-Instruct", &LoadOptions::default())?;
 /// let image = sdim::read_rgb("kitchen.jpg")?;
 /// let answer = model.answer(&image, "How far is the kettle?", &AnswerOptions::default())?;
 /// println!("{}", answer.text);
@@ -32,19 +33,20 @@ const TOP: usize = 20;
 /// ```
 pub struct ChatModel {
     /// Vision encoder and decoder.
-    pub vlm: QwenVl,
-    /// How images are resized and normalised. Lower `max_pixels` for less time and memory per image.
-    pub preprocessor: PreprocessorConfig,
+    vlm: QwenVl,
+    /// How images are resized and normalised.
+    preprocessor: PreprocessorConfig,
     /// Text to ids.
-    pub tokenizer: Tokenizer,
+    tokenizer: Tokenizer,
     /// What `generation_config.json` says.
-    pub generation: GenerationConfig,
+    generation: GenerationConfig,
     usable_vocab: usize,
     device: Device,
 }
 
 /// How to answer; what is `None` is as the checkpoint's `generation_config.json` says.
 #[derive(Debug, Clone, PartialEq)]
+#[non_exhaustive]
 pub struct AnswerOptions {
     /// Tokens at most, at least 1.
     pub max_new_tokens: usize,
@@ -59,6 +61,32 @@ pub struct AnswerOptions {
 impl Default for AnswerOptions {
     fn default() -> Self {
         Self { max_new_tokens: 128, repetition_penalty: None, sampling: None, stop_ids: None }
+    }
+}
+
+impl AnswerOptions {
+    /// With this many tokens at most.
+    pub fn with_max_new_tokens(mut self, tokens: usize) -> Self {
+        self.max_new_tokens = tokens;
+        self
+    }
+
+    /// With this repetition penalty.
+    pub fn with_repetition_penalty(mut self, penalty: f32) -> Self {
+        self.repetition_penalty = Some(penalty);
+        self
+    }
+
+    /// With tokens drawn at random.
+    pub fn with_sampling(mut self, sampling: Sampling) -> Self {
+        self.sampling = Some(sampling);
+        self
+    }
+
+    /// With these ids that end the answer.
+    pub fn with_stop_ids(mut self, ids: Vec<u32>) -> Self {
+        self.stop_ids = Some(ids);
+        self
     }
 }
 
@@ -82,16 +110,13 @@ impl ChatModel {
     ///
     /// # Errors
     /// Typed errors that name the file and the key or tensor. [`Error::TensorSet`] on a checkpoint with tensors that plain
-    /// Qwen2.5-VL does not have (load one made for depth as [`crate::model::SdimModel`]).
-    pub fn load(dir: impl AsRef<Path>, device: &Device) -> Result<Self> {
-        Self::load_as(dir, device, WeightFormat::F32)
-    }
-
-    /// As [`ChatModel::load`], with matrices kept in this form: [`WeightFormat::Bf16`] takes half the memory on the CPU.
-    ///
-    /// # Errors
-    /// As [`ChatModel::load`].
-    pub fn load_as(dir: impl AsRef<Path>, device: &Device, weights: WeightFormat) -> Result<Self> {
+    /// Qwen2.5-VL does not have (load one made for depth as [`crate::DepthCompleter`]); [`Error::Argument`] if the options name an
+    /// adapter, which is for depth.
+    pub fn load(dir: impl AsRef<Path>, options: &LoadOptions) -> Result<Self> {
+        if let Some(adapter) = &options.adapter {
+            return Err(Error::argument("adapter", adapter.display(), "none: adapters are made for depth"));
+        }
+        let device = &options.device;
         let dir = dir.as_ref();
         let source = Source::dir(dir);
         let (config, preprocessor) = (source.config()?, source.preprocessor()?);
@@ -99,11 +124,24 @@ impl ChatModel {
         let tokenizer = source.tokenizer()?;
         check_placeholder(&source, &tokenizer, &config)?;
         let generation = GenerationConfig::from_dir(dir)?;
-        let weights = Weights::from_dir(dir, device)?.with_format(weights);
+        let weights = Weights::from_dir(dir, device)?.with_format(options.weights);
         let vlm = QwenVl::new(config, &weights, RopeLayout::Contiguous)?;
         weights.finish()?;
         let usable_vocab = tokenizer.vocab_size();
         Ok(Self { vlm, preprocessor, tokenizer, generation, usable_vocab, device: device.clone() })
+    }
+
+    /// With images of at most this many pixels: less time and memory per image, and coarser sight. Published: 12,845,056.
+    ///
+    /// # Errors
+    /// [`Error::Argument`] if it is below what the checkpoint's `min_pixels` asks for.
+    pub fn with_max_pixels(mut self, pixels: usize) -> Result<Self> {
+        let least = self.preprocessor.min_pixels;
+        if pixels < least {
+            return Err(Error::argument("max_pixels", pixels, format!("at least min_pixels, {least}")));
+        }
+        self.preprocessor.max_pixels = pixels;
+        Ok(self)
     }
 
     /// Answers a question about an image, in one turn after the default system turn.

@@ -2,9 +2,11 @@
 
 pub(crate) mod json;
 pub mod lora;
+mod options;
 pub(crate) mod raw;
 pub(crate) mod shards;
 mod stored;
 pub mod weights;
 
+pub use options::LoadOptions;
 pub(crate) use stored::StoredFile;
