@@ -5,7 +5,7 @@
 use clap::Parser;
 use sdim::DepthScale;
 use sdim::benchmarks::{DepthFile, write_frame};
-use sdim::depth::io::png16;
+use sdim::depth::io;
 use sdim::depth::sample_points;
 use sdim::scenes::procedural;
 use std::path::PathBuf;
@@ -44,7 +44,7 @@ fn main() -> anyhow::Result<()> {
             let stored: Vec<u16> = sparse.as_slice().iter().map(|&d| scale.stored(d).0).collect();
             let dir = args.out.join("sparse");
             std::fs::create_dir_all(&dir)?;
-            png16::write_png16(dir.join(format!("{name}.png")), args.width, args.height, &stored)?;
+            io::write_png16(dir.join(format!("{name}.png")), args.width, args.height, &stored)?;
         }
     }
     Ok(())

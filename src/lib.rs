@@ -158,6 +158,11 @@ pub mod internals {
     pub mod query {
         pub use crate::query::*;
     }
+    #[cfg(feature = "train")]
+    pub mod supervise {
+        pub use crate::supervise::batch::*;
+        pub use crate::supervise::init::*;
+    }
     pub mod vlm {
         pub use crate::vlm::*;
     }

@@ -5,8 +5,8 @@ mod common;
 use candle_core::{Device, Tensor};
 use common::tiny;
 use sdim::internals::model::SdimModel;
+use sdim::internals::supervise::FreshFiles;
 use sdim::settings::{FusionConfig, LoraConfig, LoraMode, PixelReference, Settings};
-use sdim::supervise::init::FreshFiles;
 use sdim::{Adapter, CompleteOptions, DepthCompleter, Error, LoadOptions, QueryPlan, WeightFormat};
 use std::path::Path;
 

@@ -64,8 +64,8 @@ fn complete_writes_nothing_on_bad_input() {
     let absent = dir.path().join("absent");
     let (none, other) = (dir.path().join("none.png"), dir.path().join("other.png"));
     let scale = sdim::DepthScale::millimetres();
-    sdim::depth::io::png16::write_png16(&none, 640, 480, &[0; 640 * 480]).unwrap();
-    sdim::depth::io::png16::write_png16(&other, 480, 640, &[scale.stored(1.0).0; 640 * 480]).unwrap();
+    sdim::depth::io::write_png16(&none, 640, 480, &[0; 640 * 480]).unwrap();
+    sdim::depth::io::write_png16(&other, 480, 640, &[scale.stored(1.0).0; 640 * 480]).unwrap();
     let short = dir.path().join("short.png");
     std::fs::write(&short, &std::fs::read(&sparse).unwrap()[..3000]).unwrap();
     let cases: [(&[&str], &str); 10] = [

@@ -11,6 +11,7 @@ use sdim::internals::model::{AskOptions, Prefix, SdimModel, ask};
 use sdim::internals::query::Query;
 use sdim::internals::query::number::{DigitReader, Reading, read_bins};
 use sdim::internals::query::prompt::Tokens;
+use sdim::internals::supervise::FreshFiles;
 use sdim::internals::vlm::qwen2_5::cache::KvCache;
 use sdim::internals::vlm::qwen2_5::decoder::{Context, Keep};
 use sdim::internals::vlm::qwen2_5::grid::Grid;
@@ -19,7 +20,6 @@ use sdim::internals::vlm::qwen2_5::sequences::Sequences;
 use sdim::settings::{
     DepthUnit, Hint, MeasurementPrompt, NumberFormat, PixelReference, RopeLayout, Settings,
 };
-use sdim::supervise::init::FreshFiles;
 
 /// Largest difference, relative to the largest value.
 const TOLERANCE: f64 = 1e-4;

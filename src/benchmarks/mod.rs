@@ -19,8 +19,7 @@ mod listing;
 mod lzf;
 mod mat;
 mod nyu;
-#[doc(hidden)]
-pub mod outliers;
+pub(crate) mod outliers;
 mod parts;
 mod scannet;
 mod tum;
@@ -35,15 +34,16 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::depth::{DepthScale, SparseDepth, SparsePattern};
 use crate::error::{Error, Result};
-pub use ddad::DdadDataset;
-pub use folder::{DepthFile, FolderDataset, write_frame};
-pub use ibims::IbimsDataset;
-pub use kitti::KittiDataset;
-pub use nyu::NyuDataset;
+use ddad::DdadDataset;
+use folder::FolderDataset;
+pub use folder::{DepthFile, write_frame};
+use ibims::IbimsDataset;
+use kitti::KittiDataset;
+use nyu::NyuDataset;
 use parts::{Chosen, Ranged};
-pub use scannet::ScanNetDataset;
-pub use tum::TumDataset;
-pub use void::VoidDataset;
+use scannet::ScanNetDataset;
+use tum::TumDataset;
+use void::VoidDataset;
 
 /// Frames with ground truth, in a fixed order. Opening lists files, loading reads them.
 pub trait Dataset: Send + Sync {

@@ -8,7 +8,7 @@ pub mod interpolate;
 pub mod io;
 mod map;
 pub(crate) mod pixels;
-pub mod sampling;
+pub(crate) mod sampling;
 mod scale;
 mod sparse;
 

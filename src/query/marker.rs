@@ -46,6 +46,7 @@ impl Marker {
     ///
     /// # Errors
     /// [`Error::Config`] names the field of `sdim.json`.
+    #[doc(hidden)]
     pub fn validate(&self, file: &str) -> Result<()> {
         if (1..=MAX_SIZE).contains(&self.size) {
             return Ok(());
@@ -58,6 +59,7 @@ impl Marker {
     ///
     /// # Errors
     /// [`Error::Config`] if the frame is smaller than twice the mark and one pixel.
+    #[doc(hidden)]
     pub fn fits(&self, file: &str, width: usize, height: usize) -> Result<()> {
         if width.min(height) > 2 * self.size {
             return Ok(());
@@ -70,6 +72,7 @@ impl Marker {
     ///
     /// What would fall outside the image is left out. DepthLM never asks pixels at the left border, where its arrow has no
     /// room; here the arrow then comes from the right.
+    #[doc(hidden)]
     pub fn draw(&self, image: &mut RgbImage, x: usize, y: usize) {
         let size = self.size as i64;
         let mut put = |dx: i64, dy: i64| {

@@ -86,6 +86,7 @@ impl NumberFormat {
     ///
     /// # Errors
     /// [`Error::Config`] names the field of `sdim.json`.
+    #[doc(hidden)]
     pub fn validate(&self, file: &str) -> Result<()> {
         let (key, found, ok, expected) = match *self {
             NumberFormat::Bins { bins, range } => (

@@ -115,6 +115,7 @@ impl PromptTemplate {
     ///
     /// # Errors
     /// [`Error::Config`] names the field of `sdim.json`.
+    #[doc(hidden)]
     pub fn validate(&self, file: &str) -> Result<()> {
         let need = |key: &str, text: &str, part: &str, times: std::ops::RangeInclusive<usize>| {
             if times.contains(&text.matches(part).count()) {
@@ -136,12 +137,14 @@ impl PromptTemplate {
     }
 
     /// Metres of the unit that follows the number in the answer; `None` if no unit of length does.
+    #[doc(hidden)]
     pub fn answer_unit(&self) -> Option<f64> {
         let (_, after) = self.answer.split_once("{y}")?;
         split_unit(after).map(|(metres, _)| metres)
     }
 
     /// The answer's words before the number.
+    #[doc(hidden)]
     pub fn forced(&self) -> &str {
         self.answer.split("{y}").next().unwrap_or_default()
     }

@@ -1,7 +1,7 @@
 //! Procedural RGB-D scenes for training.
 //!
 //! [`procedural`] casts rays into random indoor and outdoor scenes: its depth is exact, its colours are as unlike each
-//! other as a real camera's. [`SparsePattern`] takes the measurements that a sensor would have made.
+//! other as a real camera's. [`crate::depth::SparsePattern`] takes the measurements that a sensor would have made.
 
 mod camera;
 mod cast;

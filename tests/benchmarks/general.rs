@@ -4,7 +4,7 @@ use std::fs;
 
 use sdim::benchmarks::{DepthFile, Layout, LayoutOptions, frame_seed, write_frame};
 use sdim::depth::SparsePattern;
-use sdim::depth::io::npy;
+use sdim::depth::io;
 use sdim::{DepthScale, Error};
 
 use crate::copies::{H, W, kitti, picture, scannet};
@@ -94,7 +94,7 @@ fn a_list_chooses_frames_in_its_order() {
         write_frame(dir.path(), name, &frame, DepthFile::Npy).unwrap();
     }
     fs::create_dir(dir.path().join("sparse")).unwrap();
-    npy::write_npy(dir.path().join("sparse/7.npy"), 16, 12, &[1.0; 192]).unwrap();
+    io::write_npy(dir.path().join("sparse/7.npy"), 16, 12, &[1.0; 192]).unwrap();
     let list = dir.path().join("list.txt");
     fs::write(&list, "7\n07\n008").unwrap();
     let options = LayoutOptions::default().with_frames(&list);
@@ -124,17 +124,17 @@ fn marigolds_folders() {
     fs::write(at("gt/0000.npy"), &file).unwrap();
     let mut sparse = [0.0; W * H];
     sparse[W + 2] = 1.75;
-    npy::write_npy(at("sparse/0000.npy"), W, H, &sparse).unwrap();
+    io::write_npy(at("sparse/0000.npy"), W, H, &sparse).unwrap();
     let sample = all(Layout::Folder, dir.path()).unwrap().remove(0);
     assert_eq!((sample.name.as_str(), sample.gt[2], sample.gt[3].is_nan()), ("0000", 1.5, true));
     assert_eq!(points(&sample), [(2, 1, 1.75)]);
     assert_eq!(sample.measurements(9, SparsePattern::Uniform, 1).unwrap().measured(), 1);
 
-    npy::write_npy(at("sparse/0000.npy"), W, H, &[0.0; W * H]).unwrap();
+    io::write_npy(at("sparse/0000.npy"), W, H, &[0.0; W * H]).unwrap();
     let sample = all(Layout::Folder, dir.path()).unwrap().remove(0);
     assert!(points(&sample).is_empty(), "a frame without a measurement is one to skip, not a damaged one");
     assert_eq!(sample.measurements(9, SparsePattern::Uniform, 1).unwrap().measured(), 0);
-    npy::write_npy(at("sparse/0000.npy"), W, H, &[2.0e4; W * H]).unwrap();
+    io::write_npy(at("sparse/0000.npy"), W, H, &[2.0e4; W * H]).unwrap();
     says(Layout::Folder, dir.path(), &["0000.npy", "20000"]);
     fs::remove_file(at("sparse/0000.npy")).unwrap();
     let sample = all(Layout::Folder, dir.path()).unwrap().remove(0);

@@ -13,7 +13,7 @@ use std::path::Path;
 
 use copies::{H, W, depth, grey8};
 use sdim::benchmarks::{Dataset, Layout, LayoutOptions, Sample};
-use sdim::depth::io::png16;
+use sdim::depth::io;
 use sdim::{Error, Result};
 
 fn open(layout: Layout, dir: &Path) -> Result<Box<dyn Dataset>> {
@@ -63,7 +63,7 @@ fn damage(layout: Layout, dir: &Path, file: &str) {
     says(layout, dir, &[name, "8-bit grey"]);
     depth(path.clone(), |_, _| 0);
     assert_eq!(without_depth(layout, dir), 1, "{name}: no damage, but nothing was measured");
-    png16::write_png16(&path, W, H + 1, &[300; W * (H + 1)]).unwrap();
+    io::write_png16(&path, W, H + 1, &[300; W * (H + 1)]).unwrap();
     says(layout, dir, &[name, "24x17", "24x16"]);
     let mut lie = whole.clone();
     lie[16..24].copy_from_slice(&[0, 0, 0x3f, 0, 0, 0, 0x3f, 0]);

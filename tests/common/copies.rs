@@ -5,7 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use image::{Rgb, RgbImage};
-use sdim::depth::io::png16;
+use sdim::depth::io;
 
 /// Size of a frame.
 pub const W: usize = 24;
@@ -27,7 +27,7 @@ pub fn picture_of(path: PathBuf, w: usize, h: usize, shade: u8) {
 /// Depth in stored units, 0 where `units` gives none.
 pub fn depth(path: PathBuf, units: impl Fn(usize, usize) -> u16) {
     let stored: Vec<u16> = (0..W * H).map(|i| units(i % W, i / W)).collect();
-    png16::write_png16(make(&path), W, H, &stored).unwrap();
+    io::write_png16(make(&path), W, H, &stored).unwrap();
 }
 
 pub fn grey8(path: &Path) {

@@ -5,9 +5,9 @@ use image::{Rgb, RgbImage};
 use sdim::SparseDepth;
 use sdim::internals::model::SdimModel;
 use sdim::internals::query::number::Numbers;
+use sdim::internals::supervise::{FreshFiles, initial};
 use sdim::internals::vlm::checkpoint::weights::Weights;
 use sdim::settings::Settings;
-use sdim::supervise::init::{FreshFiles, initial};
 use std::collections::HashMap;
 use std::path::Path;
 

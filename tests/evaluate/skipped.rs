@@ -2,7 +2,7 @@
 
 use crate::common::program;
 use crate::{Folder, results, said, succeeded, text};
-use sdim::depth::io::png16;
+use sdim::depth::io;
 use serde_json::{Value, json};
 use std::fs;
 use std::path::PathBuf;
@@ -23,8 +23,8 @@ fn with_gaps() -> (Folder, Vec<String>) {
     let files = files(&folder);
     fs::create_dir(folder.path("data/sparse")).unwrap();
     let nothing = [0; 64 * 48];
-    png16::write_png16(&files[1].0, 64, 48, &nothing).unwrap();
-    png16::write_png16(&files[2].1, 64, 48, &nothing).unwrap();
+    io::write_png16(&files[1].0, 64, 48, &nothing).unwrap();
+    io::write_png16(&files[2].1, 64, 48, &nothing).unwrap();
     fs::copy(&files[4].0, &files[4].1).unwrap();
     let name = |(truth, _): &(PathBuf, PathBuf)| truth.file_stem().unwrap().to_str().unwrap().to_string();
     let names = files.iter().map(name).collect();
@@ -112,7 +112,7 @@ fn a_damaged_file_is_an_error_that_names_it() {
 fn a_set_without_any_valid_depth_is_a_report_of_its_names() {
     let folder = Folder::new(2);
     for (truth, _) in files(&folder) {
-        png16::write_png16(&truth, 64, 48, &[0; 64 * 48]).unwrap();
+        io::write_png16(&truth, 64, 48, &[0; 64 * 48]).unwrap();
     }
     let out = succeeded(folder.classical("a", &[]));
     let text = String::from_utf8(out.stdout).unwrap();

@@ -22,6 +22,7 @@ pub fn nearest(sparse: &SparseDepth) -> Result<Vec<f32>> {
 ///
 /// # Errors
 /// [`Error::NoMeasurement`](crate::error::Error::NoMeasurement) for a map without measurements.
+#[doc(hidden)]
 pub fn distance(sparse: &SparseDepth) -> Result<Vec<f32>> {
     let squared = |a: usize, b: usize| a.abs_diff(b) as f64 * a.abs_diff(b) as f64;
     from_nearest(sparse, |(x, y), (nx, ny)| (squared(x, nx) + squared(y, ny)).sqrt() as f32)
@@ -139,6 +140,7 @@ fn nearest_columns(y: usize, found: &[u32]) -> impl Iterator<Item = usize> {
 /// The triangulation, and which triangle holds which pixel, is computed once. Outside the hull of the points, and everywhere
 /// if they lie on one line, the value is that of the nearest point. Of several points at one position the first counts.
 #[derive(Debug)]
+#[doc(hidden)]
 pub struct Interpolator {
     mesh: Mesh,
     points: usize,

@@ -102,11 +102,13 @@ impl ChatPrompt {
     }
 
     /// Number of images.
+    #[doc(hidden)]
     pub fn images(&self) -> usize {
         self.messages.iter().flat_map(|m| &m.content).filter(|&part| *part == Part::Image).count()
     }
 
     /// The text of the template, one placeholder per image, ending where the model is to speak.
+    #[doc(hidden)]
     pub fn text(&self) -> String {
         let mut out = String::new();
         if self.messages.first().is_some_and(|m| m.role != Role::System) {
@@ -139,6 +141,7 @@ impl ChatPrompt {
     /// # Errors
     /// [`Error::Tokenizer`] if the tokenizer lacks the placeholder or gives it another id than the config; as
     /// [`expand_image_placeholders`].
+    #[doc(hidden)]
     pub fn ids(&self, tokenizer: &Tokenizer, special: &SpecialIds, tokens: &[usize]) -> Result<Vec<u32>> {
         let found = tokenizer.id(IMAGE_PLACEHOLDER)?;
         if found != special.image {

@@ -28,6 +28,7 @@ impl LoraConfig {
     ///
     /// # Errors
     /// [`Error::Config`] names the field of `sdim.json`.
+    #[doc(hidden)]
     pub fn validate(&self, file: &str) -> Result<()> {
         if !(1..=4096).contains(&self.rank) {
             return Err(Error::config(file, "lora.rank", self.rank.to_string(), "1 to 4096"));
