@@ -1,59 +1,19 @@
 //! The training loop.
 
-use super::batch::{self, BatchConfig, Example};
+use super::batch::{self, Example};
+use super::config::TrainConfig;
 use super::init::{FreshFiles, initial};
 use super::loss::{self, BinLoss, LossParts};
-use super::optimiser::{AdamW, Parameters};
-use super::store;
+use super::optimiser::Parameters;
+use super::{pass, store};
 use crate::error::{Error, Result};
 use crate::fusion::{BatchStats, Normalise};
-use crate::kernels::{self, Block};
 use crate::model::SdimModel;
 use crate::query::number::{NumberFormat, POINT};
-use crate::query::prompt::Glimpse;
 use crate::query::{PixelReference, Settings};
-use crate::vlm::decoder::Context;
-use crate::vlm::preprocess::Pixels;
-use crate::vlm::rope::Position;
 use crate::vlm::weights::Weights;
-use candle_core::{Device, Tensor};
+use candle_core::Device;
 use std::path::Path;
-
-/// Everything that decides a run.
-#[derive(Debug, Clone, PartialEq, serde::Serialize, serde::Deserialize)]
-pub struct TrainConfig {
-    /// Steps of the whole schedule.
-    pub steps: usize,
-    /// Steps of linear warm-up.
-    pub warmup: usize,
-    /// Peak learning rate; falls to a hundredth along a cosine.
-    pub rate: f32,
-    /// Seed of weights and data.
-    pub seed: u64,
-    /// What a step is made of.
-    pub batch: BatchConfig,
-    /// The optimiser.
-    pub optimiser: AdamW,
-    /// Weight of the L1 on the expected depth against the cross-entropy.
-    pub l1: f32,
-    /// Share of the steps after which normalisations use their running statistics, as inference does.
-    pub freeze_norm_at: f32,
-}
-
-impl Default for TrainConfig {
-    fn default() -> Self {
-        Self {
-            steps: 5000,
-            warmup: 200,
-            rate: 1.2e-3,
-            seed: 7,
-            batch: BatchConfig::default(),
-            optimiser: AdamW::default(),
-            l1: 4.0,
-            freeze_norm_at: 0.5,
-        }
-    }
-}
 
 /// What a step reports.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -228,22 +188,10 @@ impl Trainer {
         BinLoss { range, blur: 0.0015 * widen, blur_slope: 0.008 * widen, l1: self.config.l1 }
     }
 
-    /// Forward pass over all examples, packed into one sequence of tokens.
+    /// Loss of all examples in one pass.
     fn loss(&self, examples: &[Example], stats: Option<&mut Vec<BatchStats>>) -> Result<LossParts> {
-        let image_tokens = self.encode(examples, stats)?;
-        let decoder = &self.model.vlm.decoder;
-        let packed = Packed::new(examples);
-        let embedded = self.model.vlm.embed_prompt(&packed.ids, &image_tokens)?;
-        let pairs = examples.iter().zip(&packed.glimpses);
-        let groups: Vec<_> = pairs.map(|(e, g)| (&e.pixels.resized, g.as_slice())).collect();
-        let embedded = self.model.add_glimpses(embedded, &groups)?;
-        let table = decoder.rope().table(&packed.positions, &Device::Cpu)?;
-        let layout = decoder.layout(packed.blocks);
-        let hidden = decoder.forward(&embedded, &table, Context::Packed(&layout), None)?;
-        let count = packed.supervised.len();
-        let rows = hidden.index_select(&Tensor::from_vec(packed.supervised, count, &Device::Cpu)?, 0)?;
-        let head = decoder.head_rows(&self.model.prompts.numbers().ids)?;
-        let logits = kernels::linear(&decoder.final_norm(&rows)?, &head, None)?;
+        let normalise = stats.map_or(Normalise::Running, Normalise::Batch);
+        let logits = pass::logits(&self.model, examples, normalise)?;
         let items = || examples.iter().flat_map(|e| &e.items);
         match self.model.prompts.numbers().format {
             NumberFormat::Bins { range, .. } => {
@@ -264,74 +212,5 @@ impl Trainer {
                 loss::digits(&logits, &chosen, &place, &number, numbers, f64::from(self.config.l1))
             }
         }
-    }
-
-    /// Image tokens of all examples, which have one size (Eq. 1-3).
-    fn encode(&self, examples: &[Example], stats: Option<&mut Vec<BatchStats>>) -> Result<Tensor> {
-        let frames: Vec<&Pixels> = examples.iter().map(|e| &e.pixels).collect();
-        let (width, height) = frames.first().map_or((0, 0), |p| p.resized.dimensions());
-        let sparse: Vec<f32> = examples.iter().flat_map(|e| e.scattered.iter().copied()).collect();
-        let shape = (examples.len(), height as usize, width as usize, 1);
-        let sparse = Tensor::from_vec(sparse, shape, &Device::Cpu)?;
-        self.model.encode_batch(&frames, &sparse, stats.map_or(Normalise::Running, Normalise::Batch))
-    }
-}
-
-/// All examples' tokens in one sequence: each prefix, followed by its questions, which see it and themselves.
-struct Packed {
-    ids: Vec<u32>,
-    positions: Vec<Position>,
-    blocks: Vec<Block>,
-    supervised: Vec<u32>,
-    /// Per example.
-    glimpses: Vec<Vec<Glimpse>>,
-}
-
-impl Packed {
-    fn new(examples: &[Example]) -> Self {
-        let mut out =
-            Self { ids: vec![], positions: vec![], blocks: vec![], supervised: vec![], glimpses: vec![] };
-        for e in examples {
-            out.glimpses.push(Vec::new());
-            let start = out.ids.len();
-            out.extend(&e.prefix);
-            let end = out.ids.len();
-            let p = end - start;
-            let block = Block {
-                queries: start..end,
-                shared: 0..0,
-                own_start: start,
-                q_period: p,
-                k_period: p,
-                causal: true,
-            };
-            out.blocks.push(block);
-            for run in e.items.chunk_by(|a, b| a.tokens.len() == b.tokens.len()) {
-                let (from, s) = (out.ids.len(), run[0].tokens.len());
-                for item in run {
-                    out.extend(&item.tokens);
-                    let last = out.ids.len();
-                    out.supervised.extend((last - item.supervised..last).map(|r| r as u32));
-                }
-                out.blocks.push(Block {
-                    queries: from..out.ids.len(),
-                    shared: start..end,
-                    own_start: from,
-                    q_period: s,
-                    k_period: s,
-                    causal: true,
-                });
-            }
-        }
-        out
-    }
-
-    fn extend(&mut self, tokens: &crate::query::prompt::Tokens) {
-        let start = self.ids.len();
-        if let Some(list) = self.glimpses.last_mut() {
-            list.extend(tokens.glimpses.iter().map(|g| Glimpse { token: start + g.token, ..*g }));
-        }
-        self.ids.extend(&tokens.ids);
-        self.positions.extend(&tokens.positions);
     }
 }
