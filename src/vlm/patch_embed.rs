@@ -11,8 +11,7 @@ use candle_core::Tensor;
 pub struct PatchEmbed {
     /// `[hidden, channels * frames * side * side]`
     weight: Tensor,
-    /// `[hidden, channels * side * side]`: the frames summed, for an image that is the same in each frame.
-    still: Tensor,
+    frames: usize,
     channels: usize,
     patch: usize,
     merge: usize,
@@ -28,7 +27,7 @@ impl PatchEmbed {
         let kernel = weights.get(&format!("{name}.weight"), &[config.hidden_size, c, t, p, p])?;
         Ok(Self {
             weight: kernel.reshape((config.hidden_size, config.patch_len()))?,
-            still: kernel.sum(2)?.reshape((config.hidden_size, c * p * p))?,
+            frames: t,
             channels: c,
             patch: p,
             merge: config.merge_size,
@@ -57,6 +56,14 @@ impl PatchEmbed {
             .permute(vec![0, 3, 1, 4, 6, 2, 5])?
             .contiguous()?
             .reshape((grid.patches(), self.channels * p * p))?;
-        kernels::linear(&rows_of_patches, &self.still, None)
+        kernels::linear(&rows_of_patches, &self.still()?, None)
+    }
+
+    /// `[hidden, channels * side * side]`: the frames summed, for an image that is the same in each frame. Summed in each
+    /// pass, since a weight that is trained moves under the model.
+    fn still(&self) -> Result<Tensor> {
+        let (hidden, area) = (self.weight.dim(0)?, self.patch * self.patch);
+        let kernel = self.weight.reshape((hidden, self.channels, self.frames, area))?;
+        Ok(kernel.sum(2)?.reshape((hidden, self.channels * area))?)
     }
 }
