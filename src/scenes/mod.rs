@@ -10,7 +10,6 @@ mod light;
 mod objects;
 mod patterns;
 mod rooms;
-#[cfg(feature = "benchmarks")]
 mod shapes;
 mod space;
 mod stage;
