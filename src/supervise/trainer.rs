@@ -214,3 +214,7 @@ impl Trainer {
         }
     }
 }
+
+#[cfg(test)]
+#[path = "trainer_tests.rs"]
+mod tests;
