@@ -3,7 +3,7 @@
 use super::batch::{self, Example};
 use super::config::TrainConfig;
 use super::init::{FreshFiles, initial};
-use super::loss::{self, BinLoss, LossParts};
+use super::loss::{self, BinLoss, LossParts, Target};
 use super::optimiser::Parameters;
 use super::{pass, store};
 use crate::error::{Error, Result};
@@ -22,7 +22,7 @@ pub struct StepReport {
     pub step: usize,
     /// Loss.
     pub loss: f32,
-    /// Mean absolute error of the expected number, number units.
+    /// Mean absolute error of the expected number, as a share of its frame's largest measurement.
     pub l1: f32,
     /// Norm of the gradients before clipping.
     pub gradient: f32,
@@ -195,7 +195,8 @@ impl Trainer {
         let items = || examples.iter().flat_map(|e| &e.items);
         match self.model.prompts.numbers().format {
             NumberFormat::Bins { range, .. } => {
-                loss::bins(&logits, items().map(|i| i.value).collect(), self.bin_loss(range))
+                let targets = items().map(|i| Target { value: i.value, largest: i.largest });
+                loss::bins(&logits, targets.collect(), self.bin_loss(range))
             }
             NumberFormat::Digits { .. } => {
                 let (mut chosen, mut place, mut number) = (vec![], vec![], vec![]);

@@ -2,6 +2,7 @@
 
 use super::super::optimiser::Parameter;
 use super::*;
+use crate::query::DepthUnit;
 use candle_core::Tensor;
 use std::collections::HashMap;
 
@@ -50,5 +51,28 @@ fn the_model_that_is_trained_is_the_one_that_its_values_load_as() {
         close(&format!("{what}, statistics of the batch"), batch(own), batch(&loaded));
         close(&format!("{what}, running statistics"), running(own), running(&loaded));
         close(&format!("{what}, folded"), running(own), running(&folded));
+    }
+}
+
+#[test]
+fn errors_in_metres_are_counted_in_the_largest_measurement() {
+    let metres = Settings {
+        unit: DepthUnit::Metres,
+        number: NumberFormat::Bins { bins: 1000, range: 100.0 },
+        ..Settings::tiny()
+    };
+    let digits = Settings { number: NumberFormat::Digits { decimals: 2, integers: 3 }, ..metres.clone() };
+    for settings in [metres, digits] {
+        let trainer = Trainer::new(small(), &settings).unwrap();
+        let mut examples = trainer.make_batch(0).unwrap();
+        let largest = examples[0].items[0].largest;
+        let measured = examples[0].scattered.iter().fold(0f32, |m, v| m.max(*v));
+        assert!(largest == measured && largest != 1.0, "{largest} m, {measured} m");
+        let once = trainer.loss(&examples, None).unwrap().l1;
+        for item in examples.iter_mut().flat_map(|e| &mut e.items) {
+            item.largest *= 2.0;
+        }
+        let half = trainer.loss(&examples, None).unwrap().l1;
+        assert!((once - 2.0 * half).abs() < 1e-6 * once, "{once}, {half} of twice as far a frame");
     }
 }
