@@ -9,7 +9,7 @@
 use anyhow::Context;
 use clap::Parser;
 use sdim::query::Settings;
-use sdim::supervise::{LabelSource, TrainConfig, Trainer, evaluate};
+use sdim::supervise::{LabelSource, StepReport, TrainConfig, Trainer, evaluate};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -76,6 +76,33 @@ fn score(row: &str) -> Option<f32> {
     (v.len() == 10).then(|| 0.5 * (v[6] / v[7] + v[8] / v[9]))
 }
 
+/// What was reported since the last row of the curve.
+#[derive(Default)]
+struct Since {
+    loss: f32,
+    l1: f32,
+    steps: usize,
+}
+
+impl Since {
+    /// Skipped steps have no loss to be counted.
+    fn add(&mut self, report: &StepReport) {
+        if report.skipped {
+            eprintln!("step {} skipped: its loss or gradients are not finite", report.step);
+            return;
+        }
+        self.loss += report.loss;
+        self.l1 += report.l1;
+        self.steps += 1;
+    }
+
+    fn row(&self, report: &StepReport, seconds: f32) -> String {
+        let n = self.steps as f32;
+        let StepReport { step, gradient, rate, .. } = report;
+        format!("{step},{seconds:.1},{:.4},{:.5},{gradient:.3},{rate:.2e}", self.loss / n, self.l1 / n)
+    }
+}
+
 fn main() -> anyhow::Result<()> {
     let args = Args::parse();
     sdim::kernels::keep_freed_memory();
@@ -102,26 +129,15 @@ fn main() -> anyhow::Result<()> {
     eprintln!("{} parameters, step {} of {}", trainer.parameter_count(), trainer.step(), config.steps);
 
     let stop = args.stop_at.unwrap_or(config.steps).min(config.steps);
-    let (start, mut loss, mut l1, mut seen) = (Instant::now(), 0.0, 0.0, 0);
+    let (start, mut since) = (Instant::now(), Since::default());
     while trainer.step() < stop {
         let report = trainer.train_step()?;
-        loss += report.loss;
-        l1 += report.l1;
-        seen += 1;
+        since.add(&report);
         let save = report.step % args.save_every == 0 || report.step == stop;
         if report.step % args.log_every != 0 && !save {
             continue;
         }
-        let (n, seconds) = (seen as f32, before + start.elapsed().as_secs_f32());
-        let mut row = format!(
-            "{},{seconds:.1},{:.4},{:.5},{:.3},{:.2e}",
-            report.step,
-            loss / n,
-            l1 / n,
-            report.gradient,
-            report.rate
-        );
-        (loss, l1, seen) = (0.0, 0.0, 0);
+        let mut row = std::mem::take(&mut since).row(&report, before + start.elapsed().as_secs_f32());
         if save {
             trainer.save(&args.out)?;
             let model = trainer.averaged_model()?;

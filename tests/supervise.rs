@@ -68,6 +68,23 @@ fn the_papers_words_and_digits_are_trained_on_sparse_labels() {
 }
 
 #[test]
+fn a_run_that_does_not_find_back_ends() {
+    // The first step throws the weights so far that nothing finite comes of them.
+    let wild = TrainConfig { rate: 1e30, warmup: 0, ..small() };
+    let mut trainer = Trainer::new(wild, &Settings::tiny()).unwrap();
+    assert!(!trainer.train_step().unwrap().skipped);
+    for step in 2..=20 {
+        let report = trainer.train_step().unwrap();
+        assert!(report.skipped && report.step == step, "{report:?}");
+    }
+    match trainer.train_step() {
+        Err(sdim::Error::Diverged { step, skipped }) => assert_eq!((step, skipped), (21, 20)),
+        other => panic!("{other:?}"),
+    }
+    assert_eq!(trainer.skipped(), 20);
+}
+
+#[test]
 fn running_statistics_are_measured_and_never_trained() {
     let dir = tempfile::tempdir().unwrap();
     let frozen = TrainConfig { freeze_norm_at: 0.0, ..small() };

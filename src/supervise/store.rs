@@ -8,6 +8,27 @@ use candle_core::{DType, Device, Tensor};
 use std::collections::HashMap;
 use std::path::Path;
 
+/// Counts in the state.
+const COUNTS: [&str; 2] = ["step", "skipped"];
+
+/// How far a run is.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Progress {
+    /// Steps done, those that were skipped included.
+    pub step: usize,
+    /// Steps that changed nothing, since their loss or their gradients were not finite.
+    pub skipped: usize,
+    /// The last of them, one right after the other.
+    pub skipped_in_a_row: usize,
+}
+
+impl Progress {
+    /// Steps that moved the weights.
+    pub fn updates(&self) -> usize {
+        self.step.saturating_sub(self.skipped)
+    }
+}
+
 /// Writes a checkpoint directory that [`crate::model::SdimModel::load`] reads: the averaged weights as bf16.
 ///
 /// # Errors
@@ -30,11 +51,11 @@ pub fn publish(dir: &Path, files: &FreshFiles, parameters: &Parameters) -> Resul
     Ok(())
 }
 
-/// Writes `trainer.safetensors`: values, moments and averages in f32, and the number of finished steps.
+/// Writes `trainer.safetensors`: values, moments and averages in f32, and how far the run is.
 ///
 /// # Errors
 /// [`Error::Io`], [`Error::Tensors`].
-pub fn save_state(dir: &Path, parameters: &Parameters, step: usize) -> Result<()> {
+pub fn save_state(dir: &Path, parameters: &Parameters, progress: Progress) -> Result<()> {
     std::fs::create_dir_all(dir).map_err(Error::io(dir))?;
     let mut tensors = HashMap::new();
     for (name, p) in &parameters.all {
@@ -43,16 +64,20 @@ pub fn save_state(dir: &Path, parameters: &Parameters, step: usize) -> Result<()
             tensors.insert(format!("{part}/{name}"), tensor);
         }
     }
-    tensors.insert("step".into(), Tensor::new(&[step as u32], &Device::Cpu)?);
+    let Progress { step, skipped, skipped_in_a_row } = progress;
+    for (name, counts) in [(COUNTS[0], &[step][..]), (COUNTS[1], &[skipped, skipped_in_a_row])] {
+        let counts: Vec<u32> = counts.iter().map(|&n| n as u32).collect();
+        tensors.insert(name.into(), Tensor::new(counts, &Device::Cpu)?);
+    }
     write_tensors(&dir.join("trainer.safetensors"), &tensors)
 }
 
-/// Reads what [`save_state`] wrote and returns the number of finished steps.
+/// Reads what [`save_state`] wrote and returns how far the run is. On an error the parameters are as they were.
 ///
 /// # Errors
 /// [`Error::Io`], [`Error::Format`] on a damaged file, [`Error::Tensor`] or [`Error::TensorSet`] if it belongs to another
 /// model.
-pub fn load_state(dir: &Path, parameters: &mut Parameters) -> Result<usize> {
+pub fn load_state(dir: &Path, parameters: &mut Parameters) -> Result<Progress> {
     let path = dir.join("trainer.safetensors");
     let file = path.display().to_string();
     let bytes = std::fs::read(&path).map_err(Error::io(&path))?;
@@ -65,7 +90,8 @@ pub fn load_state(dir: &Path, parameters: &mut Parameters) -> Result<usize> {
         expected,
     };
     let known = |key: &str| key.split_once('/').is_some_and(|(_, name)| parameters.all.contains_key(name));
-    let mut unexpected: Vec<String> = state.keys().filter(|k| *k != "step" && !known(k)).cloned().collect();
+    let mut unexpected: Vec<String> =
+        state.keys().filter(|k| !COUNTS.contains(&k.as_str()) && !known(k)).cloned().collect();
     if !unexpected.is_empty() {
         unexpected.sort();
         return Err(Error::TensorSet { file, missing: Vec::new(), unexpected, misshaped: Vec::new() });
@@ -80,13 +106,16 @@ pub fn load_state(dir: &Path, parameters: &mut Parameters) -> Result<usize> {
         };
         parts.push((read("value")?, read("average")?, read("m")?, read("v")?));
     }
-    let step = match state.get("step").map(|t| t.to_vec1::<u32>()) {
-        Some(Ok(step)) if step.len() == 1 => step[0] as usize,
-        _ => return Err(missing("step", "one u32".into())),
+    let counts = |name: &str, n: usize| match state.get(name).map(|t| t.to_vec1::<u32>()) {
+        Some(Ok(counts)) if counts.len() == n => Ok(counts.iter().map(|&c| c as usize).collect()),
+        _ => Err(missing(name, format!("{n} u32"))),
     };
+    let step: Vec<usize> = counts(COUNTS[0], 1)?;
+    // States of before steps could be skipped have none.
+    let skipped = if state.contains_key(COUNTS[1]) { counts(COUNTS[1], 2)? } else { vec![0, 0] };
     for (p, (values, average, m, v)) in parameters.all.values_mut().zip(parts) {
-        p.set(&values, &average)?;
-        (p.m, p.v) = (m, v);
+        p.set(&values)?;
+        (p.average, p.m, p.v) = (average, m, v);
     }
-    Ok(step)
+    Ok(Progress { step: step[0], skipped: skipped[0], skipped_in_a_row: skipped[1] })
 }

@@ -4,8 +4,9 @@ use super::batch::{self, Example};
 use super::config::TrainConfig;
 use super::init::{FreshFiles, initial};
 use super::loss::{self, BinLoss, LossParts, Target};
-use super::optimiser::Parameters;
-use super::{pass, store};
+use super::optimiser::{Gradients, Parameters};
+use super::pass;
+use super::store::{self, Progress};
 use crate::error::{Error, Result};
 use crate::fusion::{BatchStats, Normalise};
 use crate::model::SdimModel;
@@ -28,6 +29,9 @@ pub struct StepReport {
     pub gradient: f32,
     /// Learning rate.
     pub rate: f32,
+    /// Whether the step was skipped: its loss, its gradients or the statistics of its batch are not finite, so that it
+    /// changed neither weights nor moments nor statistics.
+    pub skipped: bool,
 }
 
 /// A run: the model, its parameters, and how far it is.
@@ -36,13 +40,16 @@ pub struct Trainer {
     files: FreshFiles,
     parameters: Parameters,
     model: SdimModel,
-    step: usize,
+    progress: Progress,
     /// The batch of a coming step.
     prefetched: Option<(u64, Vec<Example>)>,
 }
 
 /// Momentum of the running statistics.
 const BN_MOMENTUM: f32 = 0.05;
+
+/// Steps skipped in a row that end a run: it will not find back by itself.
+const SKIPPED_AT_MOST: usize = 20;
 
 impl Trainer {
     /// A fresh tiny model.
@@ -74,7 +81,7 @@ impl Trainer {
         let parameters = Parameters::new(start)?;
         let weights = Weights::from_tensors("training", parameters.tensors());
         let model = SdimModel::new(files.parse()?, &weights, &Device::Cpu)?;
-        Ok(Self { config, files, parameters, model, step: 0, prefetched: None })
+        Ok(Self { config, files, parameters, model, progress: Progress::default(), prefetched: None })
     }
 
     /// Continues from a state written by [`Trainer::save`].
@@ -82,7 +89,7 @@ impl Trainer {
     /// # Errors
     /// As [`store::load_state`].
     pub fn resume(&mut self, dir: &Path) -> Result<()> {
-        self.step = store::load_state(dir, &mut self.parameters)?;
+        self.progress = store::load_state(dir, &mut self.parameters)?;
         Ok(())
     }
 
@@ -92,7 +99,7 @@ impl Trainer {
     /// [`Error::Io`], [`Error::Tensors`].
     pub fn save(&self, dir: &Path) -> Result<()> {
         self.publish(dir)?;
-        store::save_state(dir, &self.parameters, self.step)
+        store::save_state(dir, &self.parameters, self.progress)
     }
 
     /// Writes the published checkpoint alone.
@@ -113,9 +120,14 @@ impl Trainer {
         SdimModel::new(self.files.parse()?, &weights, &Device::Cpu)?.fold()
     }
 
-    /// Steps done.
+    /// Steps done, those that were skipped included.
     pub fn step(&self) -> usize {
-        self.step
+        self.progress.step
+    }
+
+    /// Steps that were skipped (see [`StepReport::skipped`]).
+    pub fn skipped(&self) -> usize {
+        self.progress.skipped
     }
 
     /// Number of trained values.
@@ -133,18 +145,18 @@ impl Trainer {
         c.rate * (0.01 + 0.99 * 0.5 * (1.0 + (std::f32::consts::PI * progress.min(1.0)).cos()))
     }
 
-    /// One step on the next batch.
+    /// One step on the next batch. It is skipped if it would write numbers that are not finite.
     ///
     /// # Errors
-    /// [`Error::Argument`] if the gradients are not finite; errors of the scenes and the model.
+    /// [`Error::Diverged`] when 20 steps in a row were skipped; errors of the scenes and the model.
     pub fn train_step(&mut self) -> Result<StepReport> {
-        let step = self.step as u64;
+        let step = self.progress.step as u64;
         let examples = match self.prefetched.take() {
             Some((for_step, examples)) if for_step == step => examples,
             _ => self.make_batch(step)?,
         };
         let mut stats = Vec::new();
-        let frozen = self.step as f32 >= self.config.freeze_norm_at * self.config.steps as f32;
+        let frozen = self.progress.step as f32 >= self.config.freeze_norm_at * self.config.steps as f32;
         // The next batch is rendered in the gaps of this one: much of a backward pass runs on one thread.
         let (passes, next) = rayon::join(
             || -> Result<_> {
@@ -157,11 +169,37 @@ impl Trainer {
         let (parts, grads) = passes?;
         self.prefetched = Some((step + 1, next?));
         let loss = parts.total.to_scalar::<f32>()?;
-        let rate = self.rate(self.step);
-        let gradient = self.parameters.step(&grads, &self.config.optimiser, rate, self.step + 1)?;
-        self.update_statistics(&stats)?;
-        self.step += 1;
-        Ok(StepReport { step: self.step, loss, l1: parts.l1, gradient, rate })
+        let rate = self.rate(self.progress.step);
+        let gradients = self.parameters.gradients(&grads)?;
+        let gradient = gradients.norm();
+        let measured = stats.iter().flat_map(|s| s.mean.iter().chain(&s.var));
+        let skipped = ![loss, gradient].iter().chain(measured).all(|v| v.is_finite());
+        self.progress.step += 1;
+        if skipped {
+            self.skip()?;
+        } else {
+            self.update(gradients, &stats, rate)?;
+        }
+        Ok(StepReport { step: self.progress.step, loss, l1: parts.l1, gradient, rate, skipped })
+    }
+
+    fn skip(&mut self) -> Result<()> {
+        let p = &mut self.progress;
+        p.skipped += 1;
+        p.skipped_in_a_row += 1;
+        if p.skipped_in_a_row >= SKIPPED_AT_MOST {
+            return Err(Error::Diverged { step: p.step, skipped: p.skipped_in_a_row });
+        }
+        Ok(())
+    }
+
+    fn update(&mut self, gradients: Gradients, stats: &[BatchStats], rate: f32) -> Result<()> {
+        self.progress.skipped_in_a_row = 0;
+        let updates = self.progress.updates();
+        self.parameters.step(gradients, &self.config.optimiser, rate, updates)?;
+        self.update_statistics(stats)?;
+        self.parameters.average(&self.config.optimiser, updates);
+        Ok(())
     }
 
     fn make_batch(&self, step: u64) -> Result<Vec<Example>> {
@@ -174,7 +212,7 @@ impl Trainer {
                 if let Some(p) = self.parameters.all.get_mut(&format!("{}.{part}", s.name)) {
                     let pairs = p.values().iter().zip(new);
                     let mixed: Vec<f32> = pairs.map(|(old, new)| old + BN_MOMENTUM * (new - old)).collect();
-                    p.set(&mixed, &mixed)?;
+                    p.set(&mixed)?;
                 }
             }
         }
@@ -183,7 +221,7 @@ impl Trainer {
 
     /// Blur of the targets: wide at first, so that near misses teach, then narrow.
     fn bin_loss(&self, range: f64) -> BinLoss {
-        let progress = self.step as f32 / (0.25 * self.config.steps as f32).max(1.0);
+        let progress = self.progress.step as f32 / (0.25 * self.config.steps as f32).max(1.0);
         let widen = 1.0 + 7.0 * (1.0 - progress).max(0.0);
         BinLoss { range, blur: 0.0015 * widen, blur_slope: 0.008 * widen, l1: self.config.l1 }
     }

@@ -76,3 +76,86 @@ fn errors_in_metres_are_counted_in_the_largest_measurement() {
         assert!((once - 2.0 * half).abs() < 1e-6 * once, "{once}, {half} of twice as far a frame");
     }
 }
+
+/// Values, averages and both moments of all tensors.
+fn everything(trainer: &Trainer) -> Vec<[Vec<f32>; 4]> {
+    let all = trainer.parameters.all.values();
+    all.map(|p| [p.values().to_vec(), p.average.clone(), p.m.clone(), p.v.clone()]).collect()
+}
+
+#[test]
+fn running_statistics_are_published_averaged_as_weights_are() {
+    // The last steps are frozen: averages still come nearer.
+    let config = TrainConfig { steps: 10, freeze_norm_at: 0.6, ..small() };
+    let mut trainer = Trainer::new(config, &Settings::tiny()).unwrap();
+    let name = |n: &&String| n.contains(".running_") || n.ends_with("gate_proj.weight");
+    let names: Vec<String> = trainer.parameters.all.keys().filter(name).cloned().collect();
+    assert_eq!(names.len(), 8 + 8);
+    let mut averages: Vec<Vec<f32>> =
+        names.iter().map(|n| trainer.parameters.all[n].values().to_vec()).collect();
+    for step in 1..=10 {
+        trainer.train_step().unwrap();
+        let keep = trainer.config.optimiser.average.min((1 + step) as f32 / (10 + step) as f32);
+        for (name, average) in names.iter().zip(&mut averages) {
+            for (a, v) in average.iter_mut().zip(trainer.parameters.all[name].values()) {
+                *a += (1.0 - keep) * (v - *a);
+            }
+        }
+    }
+    let dir = tempfile::tempdir().unwrap();
+    trainer.publish(dir.path()).unwrap();
+    let published =
+        candle_core::safetensors::load(dir.path().join("model.safetensors"), &Device::Cpu).unwrap();
+    for (name, average) in names.iter().zip(&averages) {
+        let found = values(&published[name].to_dtype(candle_core::DType::F32).unwrap());
+        for (found, expected) in found.iter().zip(average) {
+            assert_eq!(*found, half::bf16::from_f32(*expected).to_f32(), "{name}");
+        }
+    }
+}
+
+#[test]
+fn a_step_that_is_not_finite_changes_nothing() {
+    let mut trainer = Trainer::new(small(), &Settings::tiny()).unwrap();
+    let first = trainer.train_step().unwrap();
+    assert!(!first.skipped && trainer.skipped() == 0);
+    let before = everything(&trainer);
+    let spoil = |trainer: &mut Trainer, name: &str, value: f32| {
+        let p = trainer.parameters.all.get_mut(name).unwrap();
+        let mut values = p.values().to_vec();
+        let good = std::mem::replace(&mut values[0], value);
+        p.set(&values).unwrap();
+        good
+    };
+    let norm = "model.norm.weight";
+    let good = spoil(&mut trainer, norm, f32::NAN);
+    let report = trainer.train_step().unwrap();
+    assert!(report.skipped && report.step == 2 && !report.gradient.is_finite(), "{report:?}");
+    spoil(&mut trainer, norm, good);
+    assert!(everything(&trainer) == before, "a skipped step left something behind");
+
+    // What was skipped is remembered over an interruption.
+    let dir = tempfile::tempdir().unwrap();
+    trainer.save(dir.path()).unwrap();
+    trainer = Trainer::new(small(), &Settings::tiny()).unwrap();
+    trainer.resume(dir.path()).unwrap();
+    assert_eq!(trainer.progress, Progress { step: 2, skipped: 1, skipped_in_a_row: 1 });
+    let report = trainer.train_step().unwrap();
+    assert!(!report.skipped && report.gradient.is_finite());
+    assert_eq!(trainer.progress, Progress { step: 3, skipped: 1, skipped_in_a_row: 0 });
+    assert_ne!(everything(&trainer), before);
+}
+
+#[test]
+fn statistics_that_are_not_finite_are_not_kept() {
+    let mut trainer = Trainer::new(small(), &Settings::tiny()).unwrap();
+    let before = everything(&trainer);
+    // The last normalisation's statistics overflow; behind it all is finite again.
+    let name = "sdim.fusion.low.conv.weight";
+    let p = trainer.parameters.all.get_mut(name).unwrap();
+    let good = p.values().to_vec();
+    p.set(&vec![3e30; good.len()]).unwrap();
+    assert!(trainer.train_step().unwrap().skipped);
+    trainer.parameters.all.get_mut(name).unwrap().set(&good).unwrap();
+    assert!(everything(&trainer) == before);
+}
