@@ -1,7 +1,10 @@
 //! Training: every way of asking can be trained, runs repeat and resume exactly, and the loss falls.
 
-use sdim::query::{MeasurementPrompt, NumberFormat, PixelReference, PromptTemplate, Settings};
+use sdim::query::{AnswerMode, Generation, Marker, MeasurementPrompt, NumberFormat, PixelReference};
+use sdim::query::{PromptTemplate, Settings};
 use sdim::supervise::{LabelSource, TrainConfig, Trainer};
+use sdim::vlm::lora::LoraConfig;
+use sdim::{Error, SdimModel};
 
 fn small() -> TrainConfig {
     let mut config = TrainConfig { steps: 40, warmup: 2, rate: 2e-3, ..Default::default() };
@@ -64,7 +67,34 @@ fn the_papers_words_and_digits_are_trained_on_sparse_labels() {
         assert!(losses.iter().all(|l| l.is_finite()), "{losses:?}");
         let mean = |l: &[f32]| l.iter().sum::<f32>() / l.len() as f32;
         assert!(mean(&losses[8..]) < mean(&losses[..4]), "{losses:?}");
+        let dir = tempfile::tempdir().unwrap();
+        trainer.publish(dir.path()).unwrap();
+        let loaded = SdimModel::load(dir.path(), &candle_core::Device::Cpu).unwrap();
+        assert_eq!(loaded.prompts.settings(), &settings);
     }
+}
+
+#[test]
+fn settings_that_would_not_come_out_as_they_are_used_are_refused() {
+    let key = |settings: &Settings| match Trainer::new(small(), settings) {
+        Err(Error::Config { file, key, .. }) => {
+            assert_eq!(file, "sdim.json");
+            key
+        }
+        Err(other) => panic!("{other}"),
+        Ok(_) => panic!("{settings:?}"),
+    };
+    let lora = LoraConfig { rank: 2, alpha: 4.0, targets: vec!["q_proj".into()] };
+    let lora = Settings { lora: Some(lora), ..Settings::tiny() };
+    assert_eq!(key(&lora), "lora");
+    let spoken = Settings { answer_mode: AnswerMode::Generate(Generation::default()), ..Settings::paper() };
+    assert_eq!(key(&spoken), "answer_mode.kind");
+    let marked = Settings {
+        template: PromptTemplate::paper_marked(),
+        pixel_reference: PixelReference::Marker(Marker::default()),
+        ..Settings::paper()
+    };
+    assert_eq!(key(&marked), "pixel_reference.kind");
 }
 
 #[test]

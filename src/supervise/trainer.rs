@@ -7,11 +7,12 @@ use super::loss::{self, BinLoss, LossParts, Target};
 use super::optimiser::{Gradients, Parameters};
 use super::pass;
 use super::store::{self, Progress};
+use crate::adapter::SETTINGS;
 use crate::error::{Error, Result};
 use crate::fusion::{BatchStats, Normalise};
 use crate::model::SdimModel;
 use crate::query::number::{NumberFormat, POINT};
-use crate::query::{PixelReference, Settings};
+use crate::query::{AnswerMode, PixelReference, Settings};
 use crate::vlm::weights::Weights;
 use candle_core::Device;
 use std::path::Path;
@@ -51,21 +52,35 @@ const BN_MOMENTUM: f32 = 0.05;
 /// Steps skipped in a row that end a run: it will not find back by itself.
 const SKIPPED_AT_MOST: usize = 20;
 
+/// Refuses settings of a model that would not come out as it is to be used; `file` is for messages.
+fn check_settings(settings: &Settings, file: &str) -> Result<()> {
+    if let PixelReference::Marker(_) = settings.pixel_reference {
+        let expected = "a pixel reference that leaves the image as it is: batches share it between questions";
+        return Err(Error::config(file, "pixel_reference.kind", "marker", expected));
+    }
+    if let AnswerMode::Generate(_) = settings.answer_mode {
+        let expected = "digits: numbers are trained, not the words of a free answer";
+        return Err(Error::config(file, "answer_mode.kind", "generate", expected));
+    }
+    if let Some(lora) = &settings.lora {
+        let expected = "none: all weights are trained themselves, without low-rank additions";
+        return Err(Error::config(file, "lora", format!("{lora:?}"), expected));
+    }
+    Ok(())
+}
+
 impl Trainer {
     /// A fresh tiny model.
     ///
     /// # Errors
-    /// [`Error::Argument`] on an empty schedule or batch.
+    /// [`Error::Argument`] on an empty schedule or batch; [`Error::Config`] on settings that cannot be trained: a marker, free
+    /// answers, LoRA.
     pub fn new(config: TrainConfig, settings: &Settings) -> Result<Self> {
         let b = &config.batch;
         if config.steps == 0 || b.frames == 0 || b.questions == 0 || b.sizes.is_empty() {
             return Err(Error::argument("train config", format!("{config:?}"), "at least one of everything"));
         }
-        if let PixelReference::Marker(_) = settings.pixel_reference {
-            let expected =
-                "a pixel reference that leaves the image as it is: batches share it between questions";
-            return Err(Error::argument("pixel_reference", "marker", expected));
-        }
+        check_settings(settings, SETTINGS)?;
         let files = FreshFiles::tiny(settings)?;
         let empty = Weights::from_tensors("fresh", Default::default());
         let parsed = files.parse()?;
