@@ -3,11 +3,12 @@
 //! `cargo run --release --example train -- --out DIR [--steps N] [--resume]`
 //!
 //! Writes DIR/{config,preprocessor_config,sdim,tokenizer}.json, model.safetensors (what `--model DIR` loads),
-//! trainer.safetensors (what `--resume` continues from), train.json (the configuration), curve.csv, and DIR/best: the
-//! checkpoint that did best on held-out scenes so far.
+//! train.json and trainer.safetensors (the configuration and the state that `--resume` continues from), curve.csv, and
+//! DIR/best: the checkpoint that did best on held-out scenes so far.
 
 use anyhow::Context;
-use clap::Parser;
+use clap::parser::ValueSource;
+use clap::{ArgMatches, CommandFactory, FromArgMatches, Parser};
 use sdim::query::Settings;
 use sdim::supervise::{LabelSource, StepReport, TrainConfig, Trainer, evaluate};
 use std::io::Write;
@@ -35,9 +36,10 @@ struct Args {
     #[arg(long, default_value_t = TrainConfig::default().batch.questions)]
     questions: usize,
     /// Labels: `dense` ground truth, or `sparse` measurements held back from the prompt.
-    #[arg(long, default_value = "dense")]
+    #[arg(long, default_value = "dense", value_parser = ["dense", "sparse"])]
     labels: String,
-    /// Continue from DIR/trainer.safetensors.
+    /// Continue from DIR/train.json and DIR/trainer.safetensors: the schedule, the batches and the seed are those of the
+    /// first run, and need not be given again.
     #[arg(long)]
     resume: bool,
     /// Stop after this many steps of the schedule (continue later with --resume).
@@ -76,6 +78,69 @@ fn score(row: &str) -> Option<f32> {
     (v.len() == 10).then(|| 0.5 * (v[6] / v[7] + v[8] / v[9]))
 }
 
+fn label_name(labels: LabelSource) -> &'static str {
+    match labels {
+        LabelSource::Dense => "dense",
+        LabelSource::Sparse => "sparse",
+    }
+}
+
+/// The configuration of a new run.
+fn config(args: &Args) -> TrainConfig {
+    let mut config =
+        TrainConfig { steps: args.steps, seed: args.seed, rate: args.rate, ..Default::default() };
+    config.batch.frames = args.frames;
+    config.batch.questions = args.questions;
+    config.batch.labels = match args.labels.as_str() {
+        "sparse" => LabelSource::Sparse,
+        _ => LabelSource::Dense,
+    };
+    config
+}
+
+/// Refuses a flag that says otherwise than the run that is to be continued.
+fn check_flags(args: &Args, given: &ArgMatches, run: &TrainConfig) -> anyhow::Result<()> {
+    let values = |c: &TrainConfig| {
+        let b = &c.batch;
+        [
+            ("steps", c.steps.to_string()),
+            ("seed", c.seed.to_string()),
+            ("rate", c.rate.to_string()),
+            ("frames", b.frames.to_string()),
+            ("questions", b.questions.to_string()),
+            ("labels", label_name(b.labels).to_string()),
+        ]
+    };
+    for ((flag, said), (_, was)) in values(&config(args)).into_iter().zip(values(run)) {
+        let told = given.value_source(flag) == Some(ValueSource::CommandLine);
+        anyhow::ensure!(
+            !told || said == was,
+            "--{flag} {said}: the run in {} has {was}; leave the flag out, or start another run",
+            args.out.display()
+        );
+    }
+    Ok(())
+}
+
+/// Writes the curve so far anew, whole, and gives the file to go on with.
+fn open_curve(path: &Path, rows: &[String]) -> anyhow::Result<std::fs::File> {
+    let part = path.with_extension("csv.part");
+    std::fs::write(&part, rows.join("\n") + "\n").with_context(|| part.display().to_string())?;
+    std::fs::rename(&part, path).with_context(|| path.display().to_string())?;
+    std::fs::File::options().append(true).open(path).with_context(|| path.display().to_string())
+}
+
+/// Relative errors on held-out scenes, as the last columns of a row.
+fn held_out(trainer: &Trainer) -> anyhow::Result<String> {
+    let model = trainer.averaged_model()?;
+    let mut columns = String::new();
+    for points in [100, 500] {
+        let e = evaluate(&model, 24, points, 1_000_000)?;
+        columns += &format!(",{:.5},{:.5}", e.model, e.linear);
+    }
+    Ok(columns)
+}
+
 /// What was reported since the last row of the curve.
 #[derive(Default)]
 struct Since {
@@ -104,31 +169,26 @@ impl Since {
 }
 
 fn main() -> anyhow::Result<()> {
-    let args = Args::parse();
+    let given = Args::command().get_matches();
+    let args = Args::from_arg_matches(&given).unwrap_or_else(|e| e.exit());
     sdim::kernels::keep_freed_memory();
-    let mut config =
-        TrainConfig { steps: args.steps, seed: args.seed, rate: args.rate, ..Default::default() };
-    config.batch.frames = args.frames;
-    config.batch.questions = args.questions;
-    config.batch.labels = match args.labels.as_str() {
-        "dense" => LabelSource::Dense,
-        "sparse" => LabelSource::Sparse,
-        other => anyhow::bail!("--labels {other}: expected dense or sparse"),
+    let mut trainer = if args.resume {
+        check_flags(&args, &given, &TrainConfig::load(&args.out)?)?;
+        Trainer::resume(&args.out)?
+    } else {
+        let trainer = Trainer::new(config(&args), &Settings::tiny())?;
+        // At once, so that nothing of a run that was here before is taken for this one's.
+        trainer.save(&args.out)?;
+        trainer
     };
-    std::fs::create_dir_all(&args.out).with_context(|| args.out.display().to_string())?;
-    let mut trainer = Trainer::new(config.clone(), &Settings::tiny())?;
-    if args.resume {
-        trainer.resume(&args.out)?;
-    }
-    std::fs::write(args.out.join("train.json"), serde_json::to_string_pretty(&config)?)?;
     let path = args.out.join("curve.csv");
     let (rows, before) = curve_until(&path, trainer.step())?;
     let mut best = rows.iter().filter_map(|r| score(r)).fold(f32::INFINITY, f32::min);
-    let mut curve = std::fs::File::create(&path).with_context(|| path.display().to_string())?;
-    writeln!(curve, "{}", rows.join("\n"))?;
-    eprintln!("{} parameters, step {} of {}", trainer.parameter_count(), trainer.step(), config.steps);
+    let mut curve = open_curve(&path, &rows)?;
+    let steps = trainer.config().steps;
+    eprintln!("{} parameters, step {} of {steps}", trainer.parameter_count(), trainer.step());
 
-    let stop = args.stop_at.unwrap_or(config.steps).min(config.steps);
+    let stop = args.stop_at.unwrap_or(steps).min(steps);
     let (start, mut since) = (Instant::now(), Since::default());
     while trainer.step() < stop {
         let report = trainer.train_step()?;
@@ -139,12 +199,7 @@ fn main() -> anyhow::Result<()> {
         }
         let mut row = std::mem::take(&mut since).row(&report, before + start.elapsed().as_secs_f32());
         if save {
-            trainer.save(&args.out)?;
-            let model = trainer.averaged_model()?;
-            for points in [100, 500] {
-                let e = evaluate(&model, 24, points, 1_000_000)?;
-                row += &format!(",{:.5},{:.5}", e.model, e.linear);
-            }
+            row += &held_out(&trainer)?;
             if let Some(s) = score(&row).filter(|s| *s < best) {
                 best = s;
                 trainer.publish(&args.out.join("best"))?;
@@ -152,6 +207,10 @@ fn main() -> anyhow::Result<()> {
         }
         writeln!(curve, "{row}")?;
         eprintln!("{row}");
+        if save {
+            // Last: a run that is interrupted before it does these steps again, and writes the same.
+            trainer.save(&args.out)?;
+        }
     }
     Ok(())
 }

@@ -22,6 +22,7 @@ pub struct Parameter {
 
 /// Settings of AdamW.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct AdamW {
     /// First moment's decay.
     pub beta1: f32,

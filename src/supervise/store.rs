@@ -8,7 +8,12 @@ use candle_core::{DType, Device, Tensor};
 use std::collections::HashMap;
 use std::path::Path;
 
-/// Counts in the state.
+/// File of the published weights.
+const MODEL: &str = "model.safetensors";
+/// File of the state to resume from.
+const STATE: &str = "trainer.safetensors";
+
+/// Counts in it.
 const COUNTS: [&str; 2] = ["step", "skipped"];
 
 /// How far a run is.
@@ -29,7 +34,9 @@ impl Progress {
     }
 }
 
-/// Writes a checkpoint directory that [`crate::model::SdimModel::load`] reads: the averaged weights as bf16.
+/// Writes a checkpoint directory that [`crate::model::SdimModel::load`] reads: the averages as bf16.
+///
+/// Whenever it is interrupted, the weights in the directory are those of the files beside them, or there are none.
 ///
 /// # Errors
 /// [`Error::Io`], [`Error::Tensors`].
@@ -39,16 +46,29 @@ pub fn publish(dir: &Path, files: &FreshFiles, parameters: &Parameters) -> Resul
     for (name, tensor) in parameters.averages()? {
         tensors.insert(name, tensor.to_dtype(DType::BF16)?);
     }
-    write_tensors(&dir.join("model.safetensors"), &tensors)?;
-    for (name, text) in [
-        ("config.json", &files.config),
-        ("preprocessor_config.json", &files.preprocessor),
-        ("sdim.json", &files.settings),
-        ("tokenizer.json", &files.tokenizer),
-    ] {
-        write_whole(&dir.join(name), text.as_bytes())?;
+    let model = dir.join(MODEL);
+    if !FreshFiles::load(dir).is_ok_and(|there| there == *files) {
+        remove(&model)?;
+        for (name, text) in files.named() {
+            write_whole(&dir.join(name), text.as_bytes())?;
+        }
     }
-    Ok(())
+    write_tensors(&model, &tensors)
+}
+
+/// Removes a state that [`save_state`] wrote, if there is one.
+///
+/// # Errors
+/// [`Error::Io`].
+pub fn remove_state(dir: &Path) -> Result<()> {
+    remove(&dir.join(STATE))
+}
+
+fn remove(path: &Path) -> Result<()> {
+    match std::fs::remove_file(path) {
+        Err(e) if e.kind() != std::io::ErrorKind::NotFound => Err(Error::io(path)(e)),
+        _ => Ok(()),
+    }
 }
 
 /// Writes `trainer.safetensors`: values, moments and averages in f32, and how far the run is.
@@ -69,7 +89,7 @@ pub fn save_state(dir: &Path, parameters: &Parameters, progress: Progress) -> Re
         let counts: Vec<u32> = counts.iter().map(|&n| n as u32).collect();
         tensors.insert(name.into(), Tensor::new(counts, &Device::Cpu)?);
     }
-    write_tensors(&dir.join("trainer.safetensors"), &tensors)
+    write_tensors(&dir.join(STATE), &tensors)
 }
 
 /// Reads what [`save_state`] wrote and returns how far the run is. On an error the parameters are as they were.
@@ -78,7 +98,7 @@ pub fn save_state(dir: &Path, parameters: &Parameters, progress: Progress) -> Re
 /// [`Error::Io`], [`Error::Format`] on a damaged file, [`Error::Tensor`] or [`Error::TensorSet`] if it belongs to another
 /// model.
 pub fn load_state(dir: &Path, parameters: &mut Parameters) -> Result<Progress> {
-    let path = dir.join("trainer.safetensors");
+    let path = dir.join(STATE);
     let file = path.display().to_string();
     let bytes = std::fs::read(&path).map_err(Error::io(&path))?;
     let state = candle_core::safetensors::load_buffer(&bytes, &Device::Cpu)

@@ -1,7 +1,7 @@
 //! The training loop.
 
 use super::batch::{self, Example};
-use super::config::TrainConfig;
+use super::config::{CONFIG, TrainConfig};
 use super::init::{FreshFiles, initial};
 use super::loss::{self, BinLoss, LossParts, Target};
 use super::optimiser::{Gradients, Parameters};
@@ -11,7 +11,7 @@ use crate::adapter::SETTINGS;
 use crate::error::{Error, Result};
 use crate::fusion::{BatchStats, Normalise};
 use crate::model::SdimModel;
-use crate::query::number::{NumberFormat, POINT};
+use crate::query::number::{NumberFormat, Numbers, POINT};
 use crate::query::{AnswerMode, PixelReference, Settings};
 use crate::vlm::weights::Weights;
 use candle_core::Device;
@@ -73,47 +73,70 @@ impl Trainer {
     /// A fresh tiny model.
     ///
     /// # Errors
-    /// [`Error::Argument`] on an empty schedule or batch; [`Error::Config`] on settings that cannot be trained: a marker, free
-    /// answers, LoRA.
+    /// [`Error::Config`] names what is out of range in the configuration (as of `train.json`), or cannot be trained of the
+    /// settings (as of `sdim.json`): a marker, free answers, LoRA.
     pub fn new(config: TrainConfig, settings: &Settings) -> Result<Self> {
-        let b = &config.batch;
-        if config.steps == 0 || b.frames == 0 || b.questions == 0 || b.sizes.is_empty() {
-            return Err(Error::argument("train config", format!("{config:?}"), "at least one of everything"));
-        }
         check_settings(settings, SETTINGS)?;
-        let files = FreshFiles::tiny(settings)?;
+        Self::start(config, FreshFiles::tiny(settings)?, Path::new(""))
+    }
+
+    /// Continues a run from the directory that [`Trainer::save`] wrote: with its configuration (`train.json`), its model's
+    /// files and its state. The steps that follow are those of a run that was never interrupted, bit for bit.
+    ///
+    /// # Errors
+    /// As [`TrainConfig::load`], [`FreshFiles::load`] and [`store::load_state`].
+    pub fn resume(dir: &Path) -> Result<Self> {
+        let mut trainer = Self::start(TrainConfig::load(dir)?, FreshFiles::load(dir)?, dir)?;
+        trainer.progress = store::load_state(dir, &mut trainer.parameters)?;
+        Ok(trainer)
+    }
+
+    /// First weights of a model of these files; `dir` is where they are from, for messages.
+    fn start(config: TrainConfig, files: FreshFiles, dir: &Path) -> Result<Self> {
+        let place = |name: &str| dir.join(name).display().to_string();
+        config.validate(&place(CONFIG))?;
         let empty = Weights::from_tensors("fresh", Default::default());
-        let parsed = files.parse()?;
-        let layers = parsed.config.text.layers;
+        let parsed = files.parse_of(dir)?;
+        check_settings(&parsed.settings, &place(SETTINGS))?;
+        let (layers, vision) = (parsed.config.text.layers, &parsed.config.vision);
+        let side = vision.patch_size * vision.merge_size;
+        if let Some(size) = config.batch.sizes.iter().find(|s| s.0 % side != 0 || s.1 % side != 0) {
+            let expected = format!("sides that are multiples of {side} pixels");
+            return Err(Error::config(&place(CONFIG), "batch.sizes", format!("{size:?}"), expected));
+        }
         // Building on nothing fails, but not before each tensor was asked for.
-        let number_ids = crate::query::number::Numbers::new(settings.number, &parsed.tokenizer)?.ids;
+        let number_ids = Numbers::new(parsed.settings.number, &parsed.tokenizer)?.ids;
         match SdimModel::new(parsed, &empty, &Device::Cpu) {
             Err(Error::TensorSet { .. }) => {}
             Err(other) => return Err(other),
             Ok(_) => return Err(Error::argument("layout", "no tensors", "a model with weights")),
         }
-        let start = initial(&empty.wanted(), &number_ids, layers, config.seed)?;
-        let parameters = Parameters::new(start)?;
+        let parameters = Parameters::new(initial(&empty.wanted(), &number_ids, layers, config.seed)?)?;
         let weights = Weights::from_tensors("training", parameters.tensors());
         let model = SdimModel::new(files.parse()?, &weights, &Device::Cpu)?;
         Ok(Self { config, files, parameters, model, progress: Progress::default(), prefetched: None })
     }
 
-    /// Continues from a state written by [`Trainer::save`].
-    ///
-    /// # Errors
-    /// As [`store::load_state`].
-    pub fn resume(&mut self, dir: &Path) -> Result<()> {
-        self.progress = store::load_state(dir, &mut self.parameters)?;
-        Ok(())
+    /// The run's configuration.
+    pub fn config(&self) -> &TrainConfig {
+        &self.config
     }
 
-    /// Writes the published checkpoint and the state to resume from.
+    /// Writes the published checkpoint, the configuration, and the state to resume from.
+    ///
+    /// Each file is written whole, and the state last. Whenever it is interrupted, the directory holds this run as it was
+    /// saved before, or no state if it held that of another run: never one run's state beside another's configuration.
     ///
     /// # Errors
     /// [`Error::Io`], [`Error::Tensors`].
     pub fn save(&self, dir: &Path) -> Result<()> {
+        let same = TrainConfig::load(dir).is_ok_and(|there| there == self.config)
+            && FreshFiles::load(dir).is_ok_and(|there| there == self.files);
+        if !same {
+            store::remove_state(dir)?;
+        }
         self.publish(dir)?;
+        self.config.save(dir)?;
         store::save_state(dir, &self.parameters, self.progress)
     }
 

@@ -137,8 +137,7 @@ fn a_step_that_is_not_finite_changes_nothing() {
     // What was skipped is remembered over an interruption.
     let dir = tempfile::tempdir().unwrap();
     trainer.save(dir.path()).unwrap();
-    trainer = Trainer::new(small(), &Settings::tiny()).unwrap();
-    trainer.resume(dir.path()).unwrap();
+    trainer = Trainer::resume(dir.path()).unwrap();
     assert_eq!(trainer.progress, Progress { step: 2, skipped: 1, skipped_in_a_row: 1 });
     let report = trainer.train_step().unwrap();
     assert!(!report.skipped && report.gradient.is_finite());
