@@ -3,13 +3,14 @@
 //! `cargo run --release --example train -- --out DIR [--steps N] [--from DIR | --resume]`
 //!
 //! Writes DIR/{config,preprocessor_config,sdim,tokenizer}.json, model.safetensors (what `--model DIR` loads),
-//! trainer.safetensors (what `--resume` continues from), train.json (the configuration), curve.csv, and DIR/best: the
-//! checkpoint that did best on held-out scenes so far.
+//! train.json and trainer.safetensors (the configuration and the state that `--resume` continues from), curve.csv, and
+//! DIR/best: the checkpoint that did best on held-out scenes so far.
 
 use anyhow::Context;
-use clap::Parser;
+use clap::parser::ValueSource;
+use clap::{ArgMatches, CommandFactory, FromArgMatches, Parser};
 use sdim::settings::Settings;
-use sdim::supervise::{LabelSource, TrainConfig, Trainer, evaluate};
+use sdim::supervise::{LabelSource, StepReport, TrainConfig, Trainer, evaluate};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -35,12 +36,13 @@ struct Args {
     #[arg(long, default_value_t = TrainConfig::default().batch.questions)]
     questions: usize,
     /// Labels: `dense` ground truth, or `sparse` measurements held back from the prompt.
-    #[arg(long, default_value = "dense")]
+    #[arg(long, default_value = "dense", value_parser = ["dense", "sparse"])]
     labels: String,
     /// Start from the weights of this checkpoint instead of random ones.
     #[arg(long, value_name = "DIR", conflicts_with = "resume")]
     from: Option<PathBuf>,
-    /// Continue from DIR/trainer.safetensors.
+    /// Continue from DIR/train.json and DIR/trainer.safetensors: the schedule, the batches and the seed are those of the
+    /// first run, and need not be given again.
     #[arg(long)]
     resume: bool,
     /// Stop after this many steps of the schedule (continue later with --resume).
@@ -79,62 +81,131 @@ fn score(row: &str) -> Option<f32> {
     (v.len() == 10).then(|| 0.5 * (v[6] / v[7] + v[8] / v[9]))
 }
 
-fn main() -> anyhow::Result<()> {
-    let args = Args::parse();
-    sdim::internals::kernels::keep_freed_memory();
+fn label_name(labels: LabelSource) -> &'static str {
+    match labels {
+        LabelSource::Dense => "dense",
+        LabelSource::Sparse => "sparse",
+    }
+}
+
+/// The configuration of a new run.
+fn config(args: &Args) -> TrainConfig {
     let mut config =
         TrainConfig { steps: args.steps, seed: args.seed, rate: args.rate, ..Default::default() };
     config.batch.frames = args.frames;
     config.batch.questions = args.questions;
     config.batch.labels = match args.labels.as_str() {
-        "dense" => LabelSource::Dense,
         "sparse" => LabelSource::Sparse,
-        other => anyhow::bail!("--labels {other}: expected dense or sparse"),
+        _ => LabelSource::Dense,
     };
-    std::fs::create_dir_all(&args.out).with_context(|| args.out.display().to_string())?;
-    let mut trainer = Trainer::new(config.clone(), &Settings::tiny())?;
-    if args.resume {
-        trainer.resume(&args.out)?;
+    config
+}
+
+/// Refuses a flag that says otherwise than the run that is to be continued.
+fn check_flags(args: &Args, given: &ArgMatches, run: &TrainConfig) -> anyhow::Result<()> {
+    let values = |c: &TrainConfig| {
+        let b = &c.batch;
+        [
+            ("steps", c.steps.to_string()),
+            ("seed", c.seed.to_string()),
+            ("rate", c.rate.to_string()),
+            ("frames", b.frames.to_string()),
+            ("questions", b.questions.to_string()),
+            ("labels", label_name(b.labels).to_string()),
+        ]
+    };
+    for ((flag, said), (_, was)) in values(&config(args)).into_iter().zip(values(run)) {
+        let told = given.value_source(flag) == Some(ValueSource::CommandLine);
+        anyhow::ensure!(
+            !told || said == was,
+            "--{flag} {said}: the run in {} has {was}; leave the flag out, or start another run",
+            args.out.display()
+        );
     }
-    if let Some(dir) = &args.from {
-        trainer.start_from(dir)?;
+    Ok(())
+}
+
+/// Writes the curve so far anew, whole, and gives the file to go on with.
+fn open_curve(path: &Path, rows: &[String]) -> anyhow::Result<std::fs::File> {
+    let part = path.with_extension("csv.part");
+    std::fs::write(&part, rows.join("\n") + "\n").with_context(|| part.display().to_string())?;
+    std::fs::rename(&part, path).with_context(|| path.display().to_string())?;
+    std::fs::File::options().append(true).open(path).with_context(|| path.display().to_string())
+}
+
+/// Relative errors on held-out scenes, as the last columns of a row.
+fn held_out(trainer: &Trainer) -> anyhow::Result<String> {
+    let model = trainer.averaged_model()?;
+    let mut columns = String::new();
+    for points in [100, 500] {
+        let e = evaluate(&model, 24, points, 1_000_000)?;
+        columns += &format!(",{:.5},{:.5}", e.model, e.linear);
     }
-    std::fs::write(args.out.join("train.json"), serde_json::to_string_pretty(&config)?)?;
+    Ok(columns)
+}
+
+/// What was reported since the last row of the curve.
+#[derive(Default)]
+struct Since {
+    loss: f32,
+    l1: f32,
+    steps: usize,
+}
+
+impl Since {
+    /// Skipped steps have no loss to be counted.
+    fn add(&mut self, report: &StepReport) {
+        if report.skipped {
+            eprintln!("step {} skipped: its loss or gradients are not finite", report.step);
+            return;
+        }
+        self.loss += report.loss;
+        self.l1 += report.l1;
+        self.steps += 1;
+    }
+
+    fn row(&self, report: &StepReport, seconds: f32) -> String {
+        let n = self.steps as f32;
+        let StepReport { step, gradient, rate, .. } = report;
+        format!("{step},{seconds:.1},{:.4},{:.5},{gradient:.3},{rate:.2e}", self.loss / n, self.l1 / n)
+    }
+}
+
+fn main() -> anyhow::Result<()> {
+    let given = Args::command().get_matches();
+    let args = Args::from_arg_matches(&given).unwrap_or_else(|e| e.exit());
+    sdim::internals::kernels::keep_freed_memory();
+    let mut trainer = if args.resume {
+        check_flags(&args, &given, &TrainConfig::load(&args.out)?)?;
+        Trainer::resume(&args.out)?
+    } else {
+        let mut trainer = Trainer::new(config(&args), &Settings::tiny())?;
+        if let Some(dir) = &args.from {
+            trainer.start_from(dir)?;
+        }
+        // At once, so that nothing of a run that was here before is taken for this one's.
+        trainer.save(&args.out)?;
+        trainer
+    };
     let path = args.out.join("curve.csv");
     let (rows, before) = curve_until(&path, trainer.step())?;
     let mut best = rows.iter().filter_map(|r| score(r)).fold(f32::INFINITY, f32::min);
-    let mut curve = std::fs::File::create(&path).with_context(|| path.display().to_string())?;
-    writeln!(curve, "{}", rows.join("\n"))?;
-    eprintln!("{} parameters, step {} of {}", trainer.parameter_count(), trainer.step(), config.steps);
+    let mut curve = open_curve(&path, &rows)?;
+    let steps = trainer.config().steps;
+    eprintln!("{} parameters, step {} of {steps}", trainer.parameter_count(), trainer.step());
 
-    let stop = args.stop_at.unwrap_or(config.steps).min(config.steps);
-    let (start, mut loss, mut l1, mut seen) = (Instant::now(), 0.0, 0.0, 0);
+    let stop = args.stop_at.unwrap_or(steps).min(steps);
+    let (start, mut since) = (Instant::now(), Since::default());
     while trainer.step() < stop {
         let report = trainer.train_step()?;
-        loss += report.loss;
-        l1 += report.l1;
-        seen += 1;
+        since.add(&report);
         let save = report.step % args.save_every == 0 || report.step == stop;
         if report.step % args.log_every != 0 && !save {
             continue;
         }
-        let (n, seconds) = (seen as f32, before + start.elapsed().as_secs_f32());
-        let mut row = format!(
-            "{},{seconds:.1},{:.4},{:.5},{:.3},{:.2e}",
-            report.step,
-            loss / n,
-            l1 / n,
-            report.gradient,
-            report.rate
-        );
-        (loss, l1, seen) = (0.0, 0.0, 0);
+        let mut row = std::mem::take(&mut since).row(&report, before + start.elapsed().as_secs_f32());
         if save {
-            trainer.save(&args.out)?;
-            let model = trainer.averaged_model()?;
-            for points in [100, 500] {
-                let e = evaluate(&model, 24, points, 1_000_000)?;
-                row += &format!(",{:.5},{:.5}", e.model, e.linear);
-            }
+            row += &held_out(&trainer)?;
             if let Some(s) = score(&row).filter(|s| *s < best) {
                 best = s;
                 trainer.publish(&args.out.join("best"))?;
@@ -142,6 +213,10 @@ fn main() -> anyhow::Result<()> {
         }
         writeln!(curve, "{row}")?;
         eprintln!("{row}");
+        if save {
+            // Last: a run that is interrupted before it does these steps again, and writes the same.
+            trainer.save(&args.out)?;
+        }
     }
     Ok(())
 }

@@ -147,6 +147,17 @@ pub enum Error {
         /// Why they were not fetched.
         reason: String,
     },
+    /// A training run cannot go on: so many steps in a row had a loss or gradients that are not finite. They changed nothing.
+    #[error(
+        "training: {skipped} steps in a row, up to step {step}, with a loss or gradients that are not finite; expected a \
+         finite number now and then: go on from an earlier checkpoint, or with a lower rate"
+    )]
+    Diverged {
+        /// The last step.
+        step: usize,
+        /// Steps in a row.
+        skipped: usize,
+    },
     /// The caller asked to stop.
     #[error("cancelled")]
     Cancelled,

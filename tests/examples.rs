@@ -96,12 +96,36 @@ fn complete_writes_nothing_on_bad_input() {
 fn train_resumes_and_its_checkpoint_loads() {
     let dir = tempfile::tempdir().unwrap();
     let model = dir.path().join("model");
-    let base =
-        ["--out", text(&model), "--steps", "4", "--frames", "1", "--questions", "8", "--log-every", "1"];
-    let first = run("train", &[&base[..], &["--stop-at", "2"]].concat());
+    let base = ["--out", text(&model), "--log-every", "1"];
+    let flags = ["--steps", "4", "--frames", "1", "--questions", "8", "--rate", "2e-3", "--stop-at", "2"];
+    let first = run("train", &[&base[..], &flags[..]].concat());
     assert!(first.status.success(), "{}", String::from_utf8_lossy(&first.stderr));
-    let second = run("train", &[&base[..], &["--resume"]].concat());
+    let written = std::fs::read(model.join("train.json")).unwrap();
+    // The flags of the first run need not be told again; one that says something else is refused.
+    let refused = |flags: &[&str], words: &[&str]| {
+        let out = run("train", &[&base[..], &["--resume"], flags].concat());
+        let said = String::from_utf8_lossy(&out.stderr).into_owned();
+        assert!(!out.status.success() && words.iter().all(|w| said.contains(w)), "{flags:?}: {said}");
+        assert!(!said.contains("panicked"), "{said}");
+    };
+    for (flag, told, was) in [
+        ("--steps", "9", "4"),
+        ("--seed", "8", "7"),
+        ("--rate", "0.001", "0.002"),
+        ("--frames", "2", "1"),
+        ("--questions", "128", "8"),
+        ("--labels", "sparse", "dense"),
+    ] {
+        refused(&[flag, told], &[&format!("{flag} {told}"), &format!("has {was}")]);
+    }
+    std::fs::write(model.join("train.json"), &written[..written.len() / 2]).unwrap();
+    refused(&[], &["train.json", "expected"]);
+    std::fs::remove_file(model.join("train.json")).unwrap();
+    refused(&[], &["train.json"]);
+    std::fs::write(model.join("train.json"), &written).unwrap();
+    let second = run("train", &[&base[..], &["--resume", "--frames", "1"]].concat());
     assert!(second.status.success(), "{}", String::from_utf8_lossy(&second.stderr));
+    assert_eq!(std::fs::read(model.join("train.json")).unwrap(), written);
     let curve = std::fs::read_to_string(model.join("curve.csv")).unwrap();
     let steps: Vec<&str> = curve.lines().skip(1).map(|l| l.split(',').next().unwrap()).collect();
     assert_eq!(steps, ["1", "2", "3", "4"]);

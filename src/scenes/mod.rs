@@ -10,7 +10,6 @@ mod light;
 mod objects;
 mod rooms;
 pub mod sensor;
-#[cfg(feature = "benchmarks")]
 mod shapes;
 mod space;
 mod stage;

@@ -29,6 +29,7 @@ pub enum LabelSource {
 
 /// What a batch is made of.
 #[derive(Debug, Clone, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct BatchConfig {
     /// Frames per step.
     pub frames: usize,

@@ -1,15 +1,19 @@
 //! A fresh small checkpoint: its configuration, its vocabulary and its initial weights.
 
 use crate::error::{Error, Result};
+use crate::files::read_text;
 use crate::model::CheckpointFiles;
+use crate::model::SETTINGS;
 use crate::query::Settings;
 use crate::query::number::{NumberFormat, bin_token};
+use crate::vlm::files::{CONFIG, PREPROCESSOR, TOKENIZER};
 use candle_core::{Device, Tensor};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
+use std::path::Path;
 
 /// Special tokens of the small vocabulary, after the 256 bytes.
 const SPECIAL: [&str; 9] = [
@@ -110,13 +114,46 @@ impl FreshFiles {
         })
     }
 
+    /// Reads them from a checkpoint directory.
+    ///
+    /// # Errors
+    /// [`Error::Io`]; [`Error::Format`] if one is no text.
+    pub fn load(dir: &Path) -> Result<Self> {
+        let read = |name: &str| {
+            let path = dir.join(name);
+            let bytes = read_text(&path)?;
+            String::from_utf8(bytes).map_err(|e| Error::format(&path, e.to_string(), "text in UTF-8"))
+        };
+        Ok(Self {
+            config: read(CONFIG)?,
+            preprocessor: read(PREPROCESSOR)?,
+            settings: read(SETTINGS)?,
+            tokenizer: read(TOKENIZER)?,
+        })
+    }
+
+    /// Their names in a checkpoint directory, and their texts.
+    pub(super) fn named(&self) -> [(&'static str, &str); 4] {
+        [
+            (CONFIG, &self.config),
+            (PREPROCESSOR, &self.preprocessor),
+            (SETTINGS, &self.settings),
+            (TOKENIZER, &self.tokenizer),
+        ]
+    }
+
     /// Parses them as a loader would.
     ///
     /// # Errors
     /// As [`CheckpointFiles::from_bytes`].
     pub fn parse(&self) -> Result<CheckpointFiles> {
-        let [c, p, s, t] = [&self.config, &self.preprocessor, &self.settings, &self.tokenizer];
-        CheckpointFiles::from_bytes("fresh", c.as_bytes(), p.as_bytes(), s.as_bytes(), t.as_bytes())
+        self.parse_of(Path::new("fresh"))
+    }
+
+    /// As [`FreshFiles::parse`]; `dir` is for messages.
+    pub(super) fn parse_of(&self, dir: &Path) -> Result<CheckpointFiles> {
+        let [c, p, s, t] = self.named().map(|(_, text)| text.as_bytes());
+        CheckpointFiles::from_bytes(&dir.display().to_string(), c, p, s, t)
     }
 }
 

@@ -1,6 +1,6 @@
 //! The loss of one answer: cross-entropy on its tokens, plus L1 on the depth that they are expected to say.
 
-use crate::error::Result;
+use crate::error::{Error, Result};
 use candle_core::{CpuStorage, CustomOp1, DType, Layout, Shape, Tensor};
 use rayon::prelude::*;
 use std::sync::Mutex;
@@ -10,12 +10,22 @@ use std::sync::Mutex;
 pub struct BinLoss {
     /// Upper end of the last bin, in number units.
     pub range: f64,
-    /// Standard deviation of the blurred target at depth 0, in number units.
+    /// Standard deviation of the blurred target at depth 0, as a share of [`Target::largest`].
     pub blur: f32,
     /// What is added to it per unit of depth.
     pub blur_slope: f32,
-    /// Weight of the L1 of the mean against the cross-entropy.
+    /// Weight of the L1 of the mean, counted in [`Target::largest`], against the cross-entropy.
     pub l1: f32,
+}
+
+/// The truth of one row of logits.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Target {
+    /// The number, in number units.
+    pub value: f32,
+    /// The frame's largest measurement in number units, above 0: what errors are counted in, so that frames of near and of
+    /// far things weigh alike whatever the unit.
+    pub largest: f32,
 }
 
 /// Mean loss over rows and its parts.
@@ -23,25 +33,26 @@ pub struct BinLoss {
 pub struct LossParts {
     /// Scalar, differentiable.
     pub total: Tensor,
-    /// Mean absolute difference between the expected and the true number, in number units.
+    /// Mean absolute difference between the expected and the true number, as a share of the frame's largest measurement.
     pub l1: f32,
 }
 
 struct BinLossOp {
     config: BinLoss,
-    targets: Vec<f32>,
+    targets: Vec<Target>,
     gradient: Mutex<Vec<f32>>,
     l1: std::sync::Arc<Mutex<f32>>,
 }
 
 impl BinLossOp {
-    /// Loss and absolute error of one row; its gradient goes to `grad`.
-    fn row(&self, logits: &[f32], target: f32, grad: &mut [f32]) -> (f64, f64) {
+    /// Loss of one row, and its absolute error as a share of the frame's largest measurement; its gradient goes to `grad`.
+    fn row(&self, logits: &[f32], target: Target, grad: &mut [f32]) -> (f64, f64) {
         let bins = logits.len();
         let width = self.config.range as f32 / bins as f32;
         let centre = |k: usize| (k as f32 + 0.5) * width;
-        let target = target.clamp(0.5 * width, self.config.range as f32 - 0.5 * width);
-        let sigma = (self.config.blur + self.config.blur_slope * target).max(0.5 * width);
+        let Target { value, largest } = target;
+        let target = value.clamp(0.5 * width, self.config.range as f32 - 0.5 * width);
+        let sigma = (self.config.blur * largest + self.config.blur_slope * target).max(0.5 * width);
 
         let max = logits.iter().copied().fold(f32::NEG_INFINITY, f32::max);
         let mut total = 0.0;
@@ -50,7 +61,7 @@ impl BinLossOp {
             total += *g;
         }
         let mean: f32 = grad.iter().enumerate().map(|(k, p)| p / total * centre(k)).sum();
-        let sign = (mean - target).signum() * self.config.l1;
+        let sign = (mean - target).signum() * self.config.l1 / largest;
 
         let blurred = |k: usize| (-0.5 * ((centre(k) - target) / sigma).powi(2)).exp();
         let reach = (5.0 * sigma / width).ceil() as usize + 1;
@@ -70,7 +81,7 @@ impl BinLossOp {
             grad[k] -= q;
             loss += f64::from(q) * f64::from(log_total - logits[k]);
         }
-        let error = f64::from((mean - target).abs());
+        let error = f64::from((mean - target).abs() / largest);
         (loss + f64::from(self.config.l1) * error, error)
     }
 }
@@ -85,6 +96,9 @@ impl CustomOp1 for BinLossOp {
         let Some((start, end)) = layout.contiguous_offsets() else {
             candle_core::bail!("bin-loss wants contiguous logits");
         };
+        if rows != self.targets.len() {
+            candle_core::bail!("bin-loss has {} targets for {rows} rows of logits", self.targets.len());
+        }
         let logits = &storage.as_slice::<f32>()?[start..end];
         let mut gradient = vec![0f32; rows * bins];
         let sums: Vec<(f64, f64)> = gradient
@@ -110,11 +124,15 @@ impl CustomOp1 for BinLossOp {
     }
 }
 
-/// Loss of number-token logits `[rows, bins]` against true numbers in number units.
+/// Loss of number-token logits `[rows, bins]` against true numbers, one per row. It does not depend on the unit: numbers,
+/// largest measurements and range all in another one give the same.
 ///
 /// # Errors
-/// [`crate::Error::Tensors`] on mismatched shapes.
-pub fn bins(logits: &Tensor, targets: Vec<f32>, config: BinLoss) -> Result<LossParts> {
+/// [`crate::Error::Tensors`] on mismatched shapes; [`crate::Error::Argument`] if a largest measurement is not above 0.
+pub fn bins(logits: &Tensor, targets: Vec<Target>, config: BinLoss) -> Result<LossParts> {
+    if let Some(t) = targets.iter().find(|t| !(t.largest > 0.0 && t.largest.is_finite())) {
+        return Err(Error::argument("largest measurement", t.largest, "a positive number"));
+    }
     let l1 = std::sync::Arc::new(Mutex::new(0.0));
     let op = BinLossOp { config, targets, gradient: Mutex::default(), l1: l1.clone() };
     let total = logits.contiguous()?.apply_op1(op)?;
@@ -124,7 +142,8 @@ pub fn bins(logits: &Tensor, targets: Vec<f32>, config: BinLoss) -> Result<LossP
 
 /// Loss of digit logits `[rows, 11]`: cross-entropy of each row's digit, plus L1 on the expected number.
 ///
-/// `chosen` is the true index of each row; `place` is the worth of a row's digit (0 for the decimal point), `number` the
+/// `chosen` is the true index of each row; `place` is the worth of a row's digit as a share of the frame's largest
+/// measurement (0 for the decimal point), `number` the
 /// number that the row belongs to, of `numbers`.
 ///
 /// # Errors
@@ -163,7 +182,7 @@ mod tests {
     fn bin_gradient_matches_finite_differences() {
         let values: Vec<f32> = (0..2 * 20).map(|i| ((i * 37 % 11) as f32 - 5.0) * 0.3).collect();
         let config = BinLoss { range: 1.0, blur: 0.02, blur_slope: 0.05, l1: 2.0 };
-        let targets = vec![0.31, 0.77];
+        let targets = [0.31, 0.77].map(|value| Target { value, largest: 0.5 }).to_vec();
         let loss = |v: &[f32]| -> f32 {
             let t = Tensor::from_vec(v.to_vec(), (2, 20), &Device::Cpu).unwrap();
             bins(&t, targets.clone(), config).unwrap().total.to_scalar().unwrap()
@@ -182,13 +201,60 @@ mod tests {
     }
 
     #[test]
+    fn the_unit_of_the_numbers_does_not_count() {
+        let logits: Vec<f32> = (0..3 * 20).map(|i| ((i * 37 % 11) as f32 - 5.0) * 0.3).collect();
+        // A power of two, so that nothing is rounded.
+        let [one, other] = [1.0, 8.0].map(|unit| {
+            let config = BinLoss { range: 1.25 * unit, blur: 0.1, blur_slope: 0.05, l1: 4.0 };
+            let unit = unit as f32;
+            let targets = [(0.31, 1.0), (0.77, 0.9), (0.05, 0.125)]
+                .map(|(value, largest)| Target { value: value * unit, largest: largest * unit });
+            let var = Var::from_vec(logits.clone(), (3, 20), &Device::Cpu).unwrap();
+            let parts = bins(&var, targets.to_vec(), config).unwrap();
+            let grads = parts.total.backward().unwrap();
+            let grad: Vec<f32> = grads.get(&var).unwrap().flatten_all().unwrap().to_vec1().unwrap();
+            (parts.total.to_scalar::<f32>().unwrap(), parts.l1, grad)
+        });
+        assert_eq!(one, other);
+    }
+
+    #[test]
+    fn errors_are_counted_in_the_largest_measurement() {
+        let config = BinLoss { range: 100.0, blur: 0.0, blur_slope: 0.0, l1: 1.0 };
+        let l1 = |value: f32, largest: f32| {
+            let t = Tensor::zeros((1, 100), DType::F32, &Device::Cpu).unwrap();
+            bins(&t, vec![Target { value, largest }], config).unwrap().l1
+        };
+        // All answers alike: 50 is expected.
+        assert!((l1(40.0, 80.0) - 10.0 / 80.0).abs() < 1e-5);
+        assert!((l1(2.0, 4.0) - 48.0 / 4.0).abs() < 1e-4);
+    }
+
+    #[test]
+    fn targets_that_cannot_be_are_refused() {
+        let config = BinLoss { range: 1.0, blur: 0.01, blur_slope: 0.0, l1: 2.0 };
+        let t = Tensor::zeros((2, 10), DType::F32, &Device::Cpu).unwrap();
+        let one = Target { value: 0.5, largest: 1.0 };
+        bins(&t, vec![one; 2], config).unwrap();
+        assert!(matches!(bins(&t, vec![one], config), Err(Error::Tensors(_))));
+        for largest in [0.0, -1.0, f32::NAN, f32::INFINITY] {
+            let wrong = Target { largest, ..one };
+            assert!(matches!(bins(&t, vec![one, wrong], config), Err(Error::Argument { .. })));
+        }
+    }
+
+    #[test]
     fn a_sure_right_answer_costs_less_than_a_sure_wrong_one() {
         let config = BinLoss { range: 1.0, blur: 0.01, blur_slope: 0.0, l1: 2.0 };
         let at = |k: usize| {
             let mut v = vec![0f32; 100];
             v[k] = 8.0;
             let t = Tensor::from_vec(v, (1, 100), &Device::Cpu).unwrap();
-            bins(&t, vec![0.405], config).unwrap().total.to_scalar::<f32>().unwrap()
+            bins(&t, vec![Target { value: 0.405, largest: 1.0 }], config)
+                .unwrap()
+                .total
+                .to_scalar::<f32>()
+                .unwrap()
         };
         assert!(at(40) < at(60) && at(60) < at(90));
     }

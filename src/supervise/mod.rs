@@ -1,14 +1,16 @@
 //! Textual supervision (Sec. 3.4): training with the answer's tokens as labels. Feature `train`.
 
 pub(crate) mod batch;
-pub(crate) mod evaluate;
+mod config;
+mod evaluate;
 pub(crate) mod init;
-pub(crate) mod loss;
-pub(crate) mod optimiser;
-pub(crate) mod store;
-pub(crate) mod trainer;
+mod loss;
+mod optimiser;
+mod pass;
+mod store;
+mod trainer;
 
 pub use batch::{BatchConfig, LabelSource};
+pub use config::TrainConfig;
 pub use evaluate::{HeldOut, evaluate};
-pub use optimiser::AdamW;
-pub use trainer::{StepReport, TrainConfig, Trainer};
+pub use trainer::{StepReport, Trainer};

@@ -22,6 +22,7 @@ pub struct Parameter {
 
 /// Settings of AdamW.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct AdamW {
     /// First moment's decay.
     pub beta1: f32,
@@ -87,12 +88,12 @@ impl Parameters {
         self.all.iter().map(|(n, p)| Ok((n.clone(), copy(p)?))).collect()
     }
 
-    /// One step; returns the gradients' norm before clipping. Running statistics have no gradient and stay.
+    /// The gradients of all tensors, out of a backward pass.
     ///
     /// # Errors
-    /// [`Error::Argument`] if the gradients are not finite (nothing is changed then).
-    pub fn step(&mut self, grads: &GradStore, config: &AdamW, rate: f32, step: usize) -> Result<f32> {
-        let mut gradients = Vec::with_capacity(self.all.len());
+    /// [`Error::Tensors`] if one cannot be read.
+    pub fn gradients(&self, grads: &GradStore) -> Result<Gradients> {
+        let mut each = Vec::with_capacity(self.all.len());
         let mut square = 0f64;
         for parameter in self.all.values() {
             let grad: Option<Vec<f32>> = match grads.get(&parameter.var) {
@@ -100,16 +101,26 @@ impl Parameters {
                 None => None,
             };
             square += grad.iter().flatten().map(|g| f64::from(*g) * f64::from(*g)).sum::<f64>();
-            gradients.push(grad);
+            each.push(grad);
         }
-        let norm = square.sqrt() as f32;
-        if !norm.is_finite() {
-            return Err(Error::argument("gradient norm", norm, "a finite number"));
+        Ok(Gradients { each, norm: square.sqrt() as f32 })
+    }
+
+    /// One step, the `step`-th from 1; the averages stay (see [`Parameters::average`]). Running statistics have no gradient
+    /// and stay, too.
+    ///
+    /// # Errors
+    /// [`Error::Argument`] if the gradients are not finite; [`Error::BufferLength`] if they are not of these tensors.
+    pub fn step(&mut self, gradients: Gradients, config: &AdamW, rate: f32, step: usize) -> Result<()> {
+        if !gradients.norm.is_finite() {
+            return Err(Error::argument("gradient norm", gradients.norm, "a finite number"));
         }
-        let scale = (config.clip / norm.max(1e-12)).min(1.0);
-        // Early averages would hold on to the random start.
-        let keep = config.average.min((1.0 + step as f32) / (10.0 + step as f32));
-        for (parameter, grad) in self.all.values_mut().zip(gradients) {
+        let (expected, found) = (self.all.len(), gradients.each.len());
+        if found != expected {
+            return Err(Error::BufferLength { what: "gradients", expected, found });
+        }
+        let scale = (config.clip / gradients.norm.max(1e-12)).min(1.0);
+        for (parameter, grad) in self.all.values_mut().zip(gradients.each) {
             let Some(grad) = grad else { continue };
             let decay = if parameter.decays { config.weight_decay } else { 0.0 };
             kernels::adamw_step(
@@ -125,12 +136,34 @@ impl Parameters {
                 step,
                 scale,
             )?;
+            parameter.sync()?;
+        }
+        Ok(())
+    }
+
+    /// Moves all averages towards the values, running statistics' as weights', as they are after the `step`-th step from 1.
+    pub fn average(&mut self, config: &AdamW, step: usize) {
+        // Early averages would hold on to the random start.
+        let keep = config.average.min((1.0 + step as f32) / (10.0 + step as f32));
+        for parameter in self.all.values_mut() {
             for (a, v) in parameter.average.iter_mut().zip(&parameter.values) {
                 *a += (1.0 - keep) * (v - *a);
             }
-            parameter.sync()?;
         }
-        Ok(norm)
+    }
+}
+
+/// Gradients of all tensors of [`Parameters`], in their order.
+pub struct Gradients {
+    /// `None` where a tensor had no part in the loss.
+    each: Vec<Option<Vec<f32>>>,
+    norm: f32,
+}
+
+impl Gradients {
+    /// Their norm before clipping.
+    pub fn norm(&self) -> f32 {
+        self.norm
     }
 }
 
@@ -144,20 +177,16 @@ impl Parameter {
         &self.values
     }
 
-    /// Sets values (and their average), for running statistics and for resuming.
+    /// Sets values, for running statistics and for resuming.
     ///
     /// # Errors
     /// [`Error::BufferLength`] on another length.
-    pub fn set(&mut self, values: &[f32], average: &[f32]) -> Result<()> {
-        if values.len() != self.values.len() || average.len() != self.values.len() {
-            return Err(Error::BufferLength {
-                what: "parameter",
-                expected: self.values.len(),
-                found: values.len().min(average.len()),
-            });
+    pub fn set(&mut self, values: &[f32]) -> Result<()> {
+        let (expected, found) = (self.values.len(), values.len());
+        if found != expected {
+            return Err(Error::BufferLength { what: "parameter", expected, found });
         }
         self.values.copy_from_slice(values);
-        self.average.copy_from_slice(average);
         self.sync()
     }
 }

@@ -9,7 +9,35 @@ use candle_core::{DType, Device, Tensor};
 use std::collections::HashMap;
 use std::path::Path;
 
-/// Writes a checkpoint directory that [`crate::model::SdimModel::load`] reads: the averaged weights as bf16.
+/// File of the published weights.
+const MODEL: &str = "model.safetensors";
+/// File of the state to resume from.
+const STATE: &str = "trainer.safetensors";
+
+/// Counts in it.
+const COUNTS: [&str; 2] = ["step", "skipped"];
+
+/// How far a run is.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Progress {
+    /// Steps done, those that were skipped included.
+    pub step: usize,
+    /// Steps that changed nothing, since their loss or their gradients were not finite.
+    pub skipped: usize,
+    /// The last of them, one right after the other.
+    pub skipped_in_a_row: usize,
+}
+
+impl Progress {
+    /// Steps that moved the weights.
+    pub fn updates(&self) -> usize {
+        self.step.saturating_sub(self.skipped)
+    }
+}
+
+/// Writes a checkpoint directory that [`crate::model::SdimModel::load`] reads: the averages as bf16.
+///
+/// Whenever it is interrupted, the weights in the directory are those of the files beside them, or there are none.
 ///
 /// # Errors
 /// [`Error::Io`], [`Error::Tensors`].
@@ -19,23 +47,36 @@ pub fn publish(dir: &Path, files: &FreshFiles, parameters: &Parameters) -> Resul
     for (name, tensor) in parameters.averages()? {
         tensors.insert(name, tensor.to_dtype(DType::BF16)?);
     }
-    write_tensors(&dir.join("model.safetensors"), &tensors)?;
-    for (name, text) in [
-        ("config.json", &files.config),
-        ("preprocessor_config.json", &files.preprocessor),
-        ("sdim.json", &files.settings),
-        ("tokenizer.json", &files.tokenizer),
-    ] {
-        write_whole(&dir.join(name), text.as_bytes())?;
+    let model = dir.join(MODEL);
+    if !FreshFiles::load(dir).is_ok_and(|there| there == *files) {
+        remove(&model)?;
+        for (name, text) in files.named() {
+            write_whole(&dir.join(name), text.as_bytes())?;
+        }
     }
-    Ok(())
+    write_tensors(&model, &tensors)
 }
 
-/// Writes `trainer.safetensors`: values, moments and averages in f32, and the number of finished steps.
+/// Removes a state that [`save_state`] wrote, if there is one.
+///
+/// # Errors
+/// [`Error::Io`].
+pub fn remove_state(dir: &Path) -> Result<()> {
+    remove(&dir.join(STATE))
+}
+
+fn remove(path: &Path) -> Result<()> {
+    match std::fs::remove_file(path) {
+        Err(e) if e.kind() != std::io::ErrorKind::NotFound => Err(Error::io(path)(e)),
+        _ => Ok(()),
+    }
+}
+
+/// Writes `trainer.safetensors`: values, moments and averages in f32, and how far the run is.
 ///
 /// # Errors
 /// [`Error::Io`], [`Error::Tensors`].
-pub fn save_state(dir: &Path, parameters: &Parameters, step: usize) -> Result<()> {
+pub fn save_state(dir: &Path, parameters: &Parameters, progress: Progress) -> Result<()> {
     std::fs::create_dir_all(dir).map_err(Error::io(dir))?;
     let mut tensors = HashMap::new();
     for (name, p) in &parameters.all {
@@ -44,8 +85,12 @@ pub fn save_state(dir: &Path, parameters: &Parameters, step: usize) -> Result<()
             tensors.insert(format!("{part}/{name}"), tensor);
         }
     }
-    tensors.insert("step".into(), Tensor::new(&[step as u32], &Device::Cpu)?);
-    write_tensors(&dir.join("trainer.safetensors"), &tensors)
+    let Progress { step, skipped, skipped_in_a_row } = progress;
+    for (name, counts) in [(COUNTS[0], &[step][..]), (COUNTS[1], &[skipped, skipped_in_a_row])] {
+        let counts: Vec<u32> = counts.iter().map(|&n| n as u32).collect();
+        tensors.insert(name.into(), Tensor::new(counts, &Device::Cpu)?);
+    }
+    write_tensors(&dir.join(STATE), &tensors)
 }
 
 /// Reads the weights of a published checkpoint (`model.safetensors`) as values and averages; moments stay as they are.
@@ -61,18 +106,19 @@ pub fn load_weights(dir: &Path, parameters: &mut Parameters) -> Result<()> {
     }
     weights.finish()?;
     for (p, values) in parameters.all.values_mut().zip(all) {
-        p.set(&values, &values)?;
+        p.set(&values)?;
+        p.average = values;
     }
     Ok(())
 }
 
-/// Reads what [`save_state`] wrote and returns the number of finished steps.
+/// Reads what [`save_state`] wrote and returns how far the run is. On an error the parameters are as they were.
 ///
 /// # Errors
 /// [`Error::Io`], [`Error::Format`] on a damaged file, [`Error::Tensor`] or [`Error::TensorSet`] if it belongs to another
 /// model.
-pub fn load_state(dir: &Path, parameters: &mut Parameters) -> Result<usize> {
-    let path = dir.join("trainer.safetensors");
+pub fn load_state(dir: &Path, parameters: &mut Parameters) -> Result<Progress> {
+    let path = dir.join(STATE);
     let file = path.display().to_string();
     let bytes = std::fs::read(&path).map_err(Error::io(&path))?;
     let state = candle_core::safetensors::load_buffer(&bytes, &Device::Cpu)
@@ -84,7 +130,8 @@ pub fn load_state(dir: &Path, parameters: &mut Parameters) -> Result<usize> {
         expected,
     };
     let known = |key: &str| key.split_once('/').is_some_and(|(_, name)| parameters.all.contains_key(name));
-    let mut unexpected: Vec<String> = state.keys().filter(|k| *k != "step" && !known(k)).cloned().collect();
+    let mut unexpected: Vec<String> =
+        state.keys().filter(|k| !COUNTS.contains(&k.as_str()) && !known(k)).cloned().collect();
     if !unexpected.is_empty() {
         unexpected.sort();
         return Err(Error::TensorSet { file, missing: Vec::new(), unexpected, misshaped: Vec::new() });
@@ -99,13 +146,16 @@ pub fn load_state(dir: &Path, parameters: &mut Parameters) -> Result<usize> {
         };
         parts.push((read("value")?, read("average")?, read("m")?, read("v")?));
     }
-    let step = match state.get("step").map(|t| t.to_vec1::<u32>()) {
-        Some(Ok(step)) if step.len() == 1 => step[0] as usize,
-        _ => return Err(missing("step", "one u32".into())),
+    let counts = |name: &str, n: usize| match state.get(name).map(|t| t.to_vec1::<u32>()) {
+        Some(Ok(counts)) if counts.len() == n => Ok(counts.iter().map(|&c| c as usize).collect()),
+        _ => Err(missing(name, format!("{n} u32"))),
     };
+    let step: Vec<usize> = counts(COUNTS[0], 1)?;
+    // States of before steps could be skipped have none.
+    let skipped = if state.contains_key(COUNTS[1]) { counts(COUNTS[1], 2)? } else { vec![0, 0] };
     for (p, (values, average, m, v)) in parameters.all.values_mut().zip(parts) {
-        p.set(&values, &average)?;
-        (p.m, p.v) = (m, v);
+        p.set(&values)?;
+        (p.average, p.m, p.v) = (average, m, v);
     }
-    Ok(step)
+    Ok(Progress { step: step[0], skipped: skipped[0], skipped_in_a_row: skipped[1] })
 }

@@ -1,59 +1,21 @@
 //! The training loop.
 
-use super::batch::{self, BatchConfig, Example};
+use super::batch::{self, Example};
+use super::config::{CONFIG, TrainConfig};
 use super::init::{FreshFiles, initial};
-use super::loss::{self, BinLoss, LossParts};
-use super::optimiser::{AdamW, Parameters};
-use super::store;
+use super::loss::{self, BinLoss, LossParts, Target};
+use super::optimiser::{Gradients, Parameters};
+use super::pass;
+use super::store::{self, Progress};
 use crate::error::{Error, Result};
 use crate::fusion::{BatchStats, Normalise};
-use crate::kernels::{self, Block};
+use crate::model::SETTINGS;
 use crate::model::SdimModel;
-use crate::query::number::{NumberFormat, POINT};
-use crate::query::prompt::Glimpse;
-use crate::query::{PixelReference, Settings};
+use crate::query::number::{NumberFormat, Numbers, POINT};
+use crate::query::{AnswerMode, PixelReference, Settings};
 use crate::vlm::checkpoint::weights::Weights;
-use crate::vlm::qwen2_5::decoder::Context;
-use crate::vlm::qwen2_5::preprocess::Pixels;
-use crate::vlm::qwen2_5::rope::Position;
-use candle_core::{Device, Tensor};
+use candle_core::Device;
 use std::path::Path;
-
-/// Everything that decides a run.
-#[derive(Debug, Clone, PartialEq, serde::Serialize, serde::Deserialize)]
-pub struct TrainConfig {
-    /// Steps of the whole schedule.
-    pub steps: usize,
-    /// Steps of linear warm-up.
-    pub warmup: usize,
-    /// Peak learning rate; falls to a hundredth along a cosine.
-    pub rate: f32,
-    /// Seed of weights and data.
-    pub seed: u64,
-    /// What a step is made of.
-    pub batch: BatchConfig,
-    /// The optimiser.
-    pub optimiser: AdamW,
-    /// Weight of the L1 on the expected depth against the cross-entropy.
-    pub l1: f32,
-    /// Share of the steps after which normalisations use their running statistics, as inference does.
-    pub freeze_norm_at: f32,
-}
-
-impl Default for TrainConfig {
-    fn default() -> Self {
-        Self {
-            steps: 5000,
-            warmup: 200,
-            rate: 1.2e-3,
-            seed: 7,
-            batch: BatchConfig::default(),
-            optimiser: AdamW::default(),
-            l1: 4.0,
-            freeze_norm_at: 0.5,
-        }
-    }
-}
 
 /// What a step reports.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -62,12 +24,15 @@ pub struct StepReport {
     pub step: usize,
     /// Loss.
     pub loss: f32,
-    /// Mean absolute error of the expected number, number units.
+    /// Mean absolute error of the expected number, as a share of its frame's largest measurement.
     pub l1: f32,
     /// Norm of the gradients before clipping.
     pub gradient: f32,
     /// Learning rate.
     pub rate: f32,
+    /// Whether the step was skipped: its loss, its gradients or the statistics of its batch are not finite, so that it
+    /// changed neither weights nor moments nor statistics.
+    pub skipped: bool,
 }
 
 /// A run: the model, its parameters, and how far it is.
@@ -76,7 +41,7 @@ pub struct Trainer {
     files: FreshFiles,
     parameters: Parameters,
     model: SdimModel,
-    step: usize,
+    progress: Progress,
     /// The batch of a coming step.
     prefetched: Option<(u64, Vec<Example>)>,
 }
@@ -84,37 +49,72 @@ pub struct Trainer {
 /// Momentum of the running statistics.
 const BN_MOMENTUM: f32 = 0.05;
 
+/// Steps skipped in a row that end a run: it will not find back by itself.
+const SKIPPED_AT_MOST: usize = 20;
+
+/// Refuses settings of a model that would not come out as it is to be used; `file` is for messages.
+fn check_settings(settings: &Settings, file: &str) -> Result<()> {
+    if let PixelReference::Marker(_) = settings.pixel_reference {
+        let expected = "a pixel reference that leaves the image as it is: batches share it between questions";
+        return Err(Error::config(file, "pixel_reference.kind", "marker", expected));
+    }
+    if let AnswerMode::Generate(_) = settings.answer_mode {
+        let expected = "digits: numbers are trained, not the words of a free answer";
+        return Err(Error::config(file, "answer_mode.kind", "generate", expected));
+    }
+    if let Some(lora) = &settings.lora {
+        let expected = "none: all weights are trained themselves, without low-rank additions";
+        return Err(Error::config(file, "lora", format!("{lora:?}"), expected));
+    }
+    Ok(())
+}
+
 impl Trainer {
     /// A fresh tiny model.
     ///
     /// # Errors
-    /// [`Error::Argument`] on an empty schedule or batch.
+    /// [`Error::Config`] names what is out of range in the configuration (as of `train.json`), or cannot be trained of the
+    /// settings (as of `sdim.json`): a marker, free answers, LoRA.
     pub fn new(config: TrainConfig, settings: &Settings) -> Result<Self> {
-        let b = &config.batch;
-        if config.steps == 0 || b.frames == 0 || b.questions == 0 || b.sizes.is_empty() {
-            return Err(Error::argument("train config", format!("{config:?}"), "at least one of everything"));
-        }
-        if let PixelReference::Marker(_) = settings.pixel_reference {
-            let expected =
-                "a pixel reference that leaves the image as it is: batches share it between questions";
-            return Err(Error::argument("pixel_reference", "marker", expected));
-        }
-        let files = FreshFiles::tiny(settings)?;
+        check_settings(settings, SETTINGS)?;
+        Self::start(config, FreshFiles::tiny(settings)?, Path::new(""))
+    }
+
+    /// Continues a run from the directory that [`Trainer::save`] wrote: with its configuration (`train.json`), its model's
+    /// files and its state. The steps that follow are those of a run that was never interrupted, bit for bit.
+    ///
+    /// # Errors
+    /// As [`TrainConfig::load`], [`FreshFiles::load`] and [`store::load_state`].
+    pub fn resume(dir: &Path) -> Result<Self> {
+        let mut trainer = Self::start(TrainConfig::load(dir)?, FreshFiles::load(dir)?, dir)?;
+        trainer.progress = store::load_state(dir, &mut trainer.parameters)?;
+        Ok(trainer)
+    }
+
+    /// First weights of a model of these files; `dir` is where they are from, for messages.
+    fn start(config: TrainConfig, files: FreshFiles, dir: &Path) -> Result<Self> {
+        let place = |name: &str| dir.join(name).display().to_string();
+        config.validate(&place(CONFIG))?;
         let empty = Weights::from_tensors("fresh", Default::default());
-        let parsed = files.parse()?;
-        let layers = parsed.config.text.layers;
+        let parsed = files.parse_of(dir)?;
+        check_settings(&parsed.settings, &place(SETTINGS))?;
+        let (layers, vision) = (parsed.config.text.layers, &parsed.config.vision);
+        let side = vision.patch_size * vision.merge_size;
+        if let Some(size) = config.batch.sizes.iter().find(|s| s.0 % side != 0 || s.1 % side != 0) {
+            let expected = format!("sides that are multiples of {side} pixels");
+            return Err(Error::config(&place(CONFIG), "batch.sizes", format!("{size:?}"), expected));
+        }
         // Building on nothing fails, but not before each tensor was asked for.
-        let number_ids = crate::query::number::Numbers::new(settings.number, &parsed.tokenizer)?.ids;
+        let number_ids = Numbers::new(parsed.settings.number, &parsed.tokenizer)?.ids;
         match SdimModel::new(parsed, &empty, &Device::Cpu) {
             Err(Error::TensorSet { .. }) => {}
             Err(other) => return Err(other),
             Ok(_) => return Err(Error::argument("layout", "no tensors", "a model with weights")),
         }
-        let start = initial(&empty.wanted(), &number_ids, layers, config.seed)?;
-        let parameters = Parameters::new(start)?;
+        let parameters = Parameters::new(initial(&empty.wanted(), &number_ids, layers, config.seed)?)?;
         let weights = Weights::from_tensors("training", parameters.tensors());
         let model = SdimModel::new(files.parse()?, &weights, &Device::Cpu)?;
-        Ok(Self { config, files, parameters, model, step: 0, prefetched: None })
+        Ok(Self { config, files, parameters, model, progress: Progress::default(), prefetched: None })
     }
 
     /// Starts from the weights of a checkpoint of the same shape, with fresh moments at step 0, as after [`Trainer::new`].
@@ -124,26 +124,31 @@ impl Trainer {
     /// model.
     pub fn start_from(&mut self, dir: &Path) -> Result<()> {
         store::load_weights(dir, &mut self.parameters)?;
-        (self.step, self.prefetched) = (0, None);
+        (self.progress, self.prefetched) = (Progress::default(), None);
         Ok(())
     }
 
-    /// Continues from a state written by [`Trainer::save`].
+    /// The run's configuration.
+    pub fn config(&self) -> &TrainConfig {
+        &self.config
+    }
+
+    /// Writes the published checkpoint, the configuration, and the state to resume from.
     ///
-    /// # Errors
-    /// As [`store::load_state`].
-    pub fn resume(&mut self, dir: &Path) -> Result<()> {
-        self.step = store::load_state(dir, &mut self.parameters)?;
-        Ok(())
-    }
-
-    /// Writes the published checkpoint and the state to resume from.
+    /// Each file is written whole, and the state last. Whenever it is interrupted, the directory holds this run as it was
+    /// saved before, or no state if it held that of another run: never one run's state beside another's configuration.
     ///
     /// # Errors
     /// [`Error::Io`], [`Error::Tensors`].
     pub fn save(&self, dir: &Path) -> Result<()> {
+        let same = TrainConfig::load(dir).is_ok_and(|there| there == self.config)
+            && FreshFiles::load(dir).is_ok_and(|there| there == self.files);
+        if !same {
+            store::remove_state(dir)?;
+        }
         self.publish(dir)?;
-        store::save_state(dir, &self.parameters, self.step)
+        self.config.save(dir)?;
+        store::save_state(dir, &self.parameters, self.progress)
     }
 
     /// Writes the published checkpoint alone.
@@ -165,9 +170,14 @@ impl Trainer {
         SdimModel::new(self.files.parse()?, &weights, &Device::Cpu)?.fold()
     }
 
-    /// Steps done.
+    /// Steps done, those that were skipped included.
     pub fn step(&self) -> usize {
-        self.step
+        self.progress.step
+    }
+
+    /// Steps that were skipped (see [`StepReport::skipped`]).
+    pub fn skipped(&self) -> usize {
+        self.progress.skipped
     }
 
     /// Number of trained values.
@@ -185,18 +195,18 @@ impl Trainer {
         c.rate * (0.01 + 0.99 * 0.5 * (1.0 + (std::f32::consts::PI * progress.min(1.0)).cos()))
     }
 
-    /// One step on the next batch.
+    /// One step on the next batch. It is skipped if it would write numbers that are not finite.
     ///
     /// # Errors
-    /// [`Error::Argument`] if the gradients are not finite; errors of the scenes and the model.
+    /// [`Error::Diverged`] when 20 steps in a row were skipped; errors of the scenes and the model.
     pub fn train_step(&mut self) -> Result<StepReport> {
-        let step = self.step as u64;
+        let step = self.progress.step as u64;
         let examples = match self.prefetched.take() {
             Some((for_step, examples)) if for_step == step => examples,
             _ => self.make_batch(step)?,
         };
         let mut stats = Vec::new();
-        let frozen = self.step as f32 >= self.config.freeze_norm_at * self.config.steps as f32;
+        let frozen = self.progress.step as f32 >= self.config.freeze_norm_at * self.config.steps as f32;
         // The next batch is rendered in the gaps of this one: much of a backward pass runs on one thread.
         let (passes, next) = rayon::join(
             || -> Result<_> {
@@ -209,11 +219,37 @@ impl Trainer {
         let (parts, grads) = passes?;
         self.prefetched = Some((step + 1, next?));
         let loss = parts.total.to_scalar::<f32>()?;
-        let rate = self.rate(self.step);
-        let gradient = self.parameters.step(&grads, &self.config.optimiser, rate, self.step + 1)?;
-        self.update_statistics(&stats)?;
-        self.step += 1;
-        Ok(StepReport { step: self.step, loss, l1: parts.l1, gradient, rate })
+        let rate = self.rate(self.progress.step);
+        let gradients = self.parameters.gradients(&grads)?;
+        let gradient = gradients.norm();
+        let measured = stats.iter().flat_map(|s| s.mean.iter().chain(&s.var));
+        let skipped = ![loss, gradient].iter().chain(measured).all(|v| v.is_finite());
+        self.progress.step += 1;
+        if skipped {
+            self.skip()?;
+        } else {
+            self.update(gradients, &stats, rate)?;
+        }
+        Ok(StepReport { step: self.progress.step, loss, l1: parts.l1, gradient, rate, skipped })
+    }
+
+    fn skip(&mut self) -> Result<()> {
+        let p = &mut self.progress;
+        p.skipped += 1;
+        p.skipped_in_a_row += 1;
+        if p.skipped_in_a_row >= SKIPPED_AT_MOST {
+            return Err(Error::Diverged { step: p.step, skipped: p.skipped_in_a_row });
+        }
+        Ok(())
+    }
+
+    fn update(&mut self, gradients: Gradients, stats: &[BatchStats], rate: f32) -> Result<()> {
+        self.progress.skipped_in_a_row = 0;
+        let updates = self.progress.updates();
+        self.parameters.step(gradients, &self.config.optimiser, rate, updates)?;
+        self.update_statistics(stats)?;
+        self.parameters.average(&self.config.optimiser, updates);
+        Ok(())
     }
 
     fn make_batch(&self, step: u64) -> Result<Vec<Example>> {
@@ -226,7 +262,7 @@ impl Trainer {
                 if let Some(p) = self.parameters.all.get_mut(&format!("{}.{part}", s.name)) {
                     let pairs = p.values().iter().zip(new);
                     let mixed: Vec<f32> = pairs.map(|(old, new)| old + BN_MOMENTUM * (new - old)).collect();
-                    p.set(&mixed, &mixed)?;
+                    p.set(&mixed)?;
                 }
             }
         }
@@ -235,31 +271,20 @@ impl Trainer {
 
     /// Blur of the targets: wide at first, so that near misses teach, then narrow.
     fn bin_loss(&self, range: f64) -> BinLoss {
-        let progress = self.step as f32 / (0.25 * self.config.steps as f32).max(1.0);
+        let progress = self.progress.step as f32 / (0.25 * self.config.steps as f32).max(1.0);
         let widen = 1.0 + 7.0 * (1.0 - progress).max(0.0);
         BinLoss { range, blur: 0.0015 * widen, blur_slope: 0.008 * widen, l1: self.config.l1 }
     }
 
-    /// Forward pass over all examples, packed into one sequence of tokens.
+    /// Loss of all examples in one pass.
     fn loss(&self, examples: &[Example], stats: Option<&mut Vec<BatchStats>>) -> Result<LossParts> {
-        let image_tokens = self.encode(examples, stats)?;
-        let decoder = &self.model.vlm.decoder;
-        let packed = Packed::new(examples);
-        let embedded = self.model.vlm.embed_prompt(&packed.ids, &image_tokens)?;
-        let pairs = examples.iter().zip(&packed.glimpses);
-        let groups: Vec<_> = pairs.map(|(e, g)| (&e.pixels.resized, g.as_slice())).collect();
-        let embedded = self.model.add_glimpses(embedded, &groups)?;
-        let table = decoder.rope().table(&packed.positions, &Device::Cpu)?;
-        let layout = decoder.layout(packed.blocks);
-        let hidden = decoder.forward(&embedded, &table, Context::Packed(&layout), None)?;
-        let count = packed.supervised.len();
-        let rows = hidden.index_select(&Tensor::from_vec(packed.supervised, count, &Device::Cpu)?, 0)?;
-        let head = decoder.head_rows(&self.model.prompts.numbers().ids)?;
-        let logits = kernels::linear(&decoder.final_norm(&rows)?, &head, None)?;
+        let normalise = stats.map_or(Normalise::Running, Normalise::Batch);
+        let logits = pass::logits(&self.model, examples, normalise)?;
         let items = || examples.iter().flat_map(|e| &e.items);
         match self.model.prompts.numbers().format {
             NumberFormat::Bins { range, .. } => {
-                loss::bins(&logits, items().map(|i| i.value).collect(), self.bin_loss(range))
+                let targets = items().map(|i| Target { value: i.value, largest: i.largest });
+                loss::bins(&logits, targets.collect(), self.bin_loss(range))
             }
             NumberFormat::Digits { .. } => {
                 let (mut chosen, mut place, mut number) = (vec![], vec![], vec![]);
@@ -277,73 +302,8 @@ impl Trainer {
             }
         }
     }
-
-    /// Image tokens of all examples, which have one size (Eq. 1-3).
-    fn encode(&self, examples: &[Example], stats: Option<&mut Vec<BatchStats>>) -> Result<Tensor> {
-        let frames: Vec<&Pixels> = examples.iter().map(|e| &e.pixels).collect();
-        let (width, height) = frames.first().map_or((0, 0), |p| p.resized.dimensions());
-        let sparse: Vec<f32> = examples.iter().flat_map(|e| e.scattered.iter().copied()).collect();
-        let shape = (examples.len(), height as usize, width as usize, 1);
-        let sparse = Tensor::from_vec(sparse, shape, &Device::Cpu)?;
-        self.model.encode_batch(&frames, &sparse, stats.map_or(Normalise::Running, Normalise::Batch))
-    }
 }
 
-/// All examples' tokens in one sequence: each prefix, followed by its questions, which see it and themselves.
-struct Packed {
-    ids: Vec<u32>,
-    positions: Vec<Position>,
-    blocks: Vec<Block>,
-    supervised: Vec<u32>,
-    /// Per example.
-    glimpses: Vec<Vec<Glimpse>>,
-}
-
-impl Packed {
-    fn new(examples: &[Example]) -> Self {
-        let mut out =
-            Self { ids: vec![], positions: vec![], blocks: vec![], supervised: vec![], glimpses: vec![] };
-        for e in examples {
-            out.glimpses.push(Vec::new());
-            let start = out.ids.len();
-            out.extend(&e.prefix);
-            let end = out.ids.len();
-            let p = end - start;
-            let block = Block {
-                queries: start..end,
-                shared: 0..0,
-                own_start: start,
-                q_period: p,
-                k_period: p,
-                causal: true,
-            };
-            out.blocks.push(block);
-            for run in e.items.chunk_by(|a, b| a.tokens.len() == b.tokens.len()) {
-                let (from, s) = (out.ids.len(), run[0].tokens.len());
-                for item in run {
-                    out.extend(&item.tokens);
-                    let last = out.ids.len();
-                    out.supervised.extend((last - item.supervised..last).map(|r| r as u32));
-                }
-                out.blocks.push(Block {
-                    queries: from..out.ids.len(),
-                    shared: start..end,
-                    own_start: from,
-                    q_period: s,
-                    k_period: s,
-                    causal: true,
-                });
-            }
-        }
-        out
-    }
-
-    fn extend(&mut self, tokens: &crate::query::prompt::Tokens) {
-        let start = self.ids.len();
-        if let Some(list) = self.glimpses.last_mut() {
-            list.extend(tokens.glimpses.iter().map(|g| Glimpse { token: start + g.token, ..*g }));
-        }
-        self.ids.extend(&tokens.ids);
-        self.positions.extend(&tokens.positions);
-    }
-}
+#[cfg(test)]
+#[path = "trainer_tests.rs"]
+mod tests;
