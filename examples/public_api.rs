@@ -1,23 +1,27 @@
 //! Lists the public items of the crate, one per line, from rustdoc's JSON: the committed list is `docs/public-api.txt`.
 //!
 //! ```sh
-//! RUSTC_BOOTSTRAP=1 cargo rustdoc --release --lib --features train,benchmarks,hub -- -Z unstable-options --output-format json
-//! cargo run --release --example public_api -- target/doc/sdim.json > docs/public-api.txt
+//! .ci/public-api            # compares; --write writes the list
 //! ```
 //!
 //! What is hidden from the documentation is not in the list, nor are implementations of traits. An item that stands in several
-//! places is listed at each of them.
+//! places is listed at the outermost of them; the others are `use` lines.
 
 use anyhow::{Context, bail};
 use serde_json::Value;
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 fn main() -> anyhow::Result<()> {
     let path = std::env::args().nth(1).context("usage: public_api RUSTDOC.json")?;
     let json: Value = serde_json::from_slice(&std::fs::read(&path).with_context(|| path.clone())?)?;
-    let mut list = List { json: &json, lines: BTreeSet::new() };
+    let mut list =
+        List { json: &json, lines: BTreeSet::new(), places: BTreeMap::new(), modules: VecDeque::new() };
     let root = list.item(&json["root"]).context("no root item: is this rustdoc's JSON?")?;
-    list.module(root, "sdim");
+    list.modules.push_back((root, "sdim".to_string()));
+    // Breadth first, so that the outermost place of an item comes first.
+    while let Some((module, path)) = list.modules.pop_front() {
+        list.module(module, &path);
+    }
     if list.lines.len() < 10 {
         bail!("{path}: {} items only; rustdoc may write another format now", list.lines.len());
     }
@@ -30,6 +34,9 @@ fn main() -> anyhow::Result<()> {
 struct List<'j> {
     json: &'j Value,
     lines: BTreeSet<String>,
+    /// The first place of each item, by its id.
+    places: BTreeMap<String, String>,
+    modules: VecDeque<(&'j Value, String)>,
 }
 
 impl<'j> List<'j> {
@@ -59,11 +66,18 @@ impl<'j> List<'j> {
         let Some((kind, inner)) = item["inner"].as_object().and_then(|o| o.iter().next()) else { return };
         let name = renamed.or(item["name"].as_str()).unwrap_or_default();
         let full = format!("{path}::{name}");
+        if kind != "use" {
+            let place = self.places.entry(item["id"].to_string()).or_insert_with(|| full.clone());
+            if *place != full {
+                let line = format!("use {full} = {place}");
+                return self.line(line);
+            }
+        }
         match kind.as_str() {
             "use" => self.reexport(inner, path),
             "module" => {
                 self.line(format!("mod {full}"));
-                self.module(item, &full);
+                self.modules.push_back((item, full));
             }
             "struct" => {
                 self.line(format!("struct {full}{}", generics(&inner["generics"])));
