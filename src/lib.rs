@@ -81,6 +81,7 @@
 //! and `Send + Sync`. The same frame gives the same map, whatever the number of threads. CPU kernels are chosen at run time; the variable
 //! `SDIM_KERNEL` (`portable`, `avx2`, `avx512`, `amx`, `neon`) forces one, and [`WeightFormat`] says how matrices are held.
 
+#![cfg_attr(docsrs, feature(doc_cfg))]
 #![deny(missing_docs)]
 #![deny(unsafe_op_in_unsafe_fn)]
 #![warn(clippy::all)]

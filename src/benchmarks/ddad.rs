@@ -2,10 +2,10 @@
 
 use std::path::{Path, PathBuf};
 
+use super::dataset::{Sample, frame_seed};
 use super::files::{all_taken, depth, first_with, list, list_some, picture, take, unpaired};
 use super::listing::{Frame, Loader};
 use super::outliers::{THRESHOLD, WINDOW, remove_outliers};
-use super::{Sample, frame_seed};
 use crate::depth::{DepthScale, SparseDepth, sample_points};
 use crate::error::Result;
 

@@ -58,8 +58,9 @@ fn scales(path: &Path) -> Result<HashMap<String, DepthScale>> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::{Dataset, FolderDataset};
     use super::*;
+    use crate::benchmarks::FolderDataset;
+    use crate::benchmarks::dataset::Dataset;
     use crate::depth::io::png16;
 
     fn write(dir: &Path, name: &str, value: u16) {

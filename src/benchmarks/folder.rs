@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use image::ImageFormat;
 
-use super::Sample;
+use super::dataset::Sample;
 use super::files::{Listed, PICTURES, all_taken, depth, list, list_some, picture, take, unpaired};
 use super::flat::Flat;
 use super::listing::{Frame, Loader};
@@ -135,8 +135,8 @@ fn in_units(metres: f32, scale: DepthScale) -> u16 {
 
 #[cfg(test)]
 mod tests {
-    use super::super::Dataset;
     use super::*;
+    use crate::benchmarks::dataset::Dataset;
     use crate::scenes::procedural;
 
     #[test]

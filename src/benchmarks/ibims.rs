@@ -4,10 +4,10 @@ use std::path::{Path, PathBuf};
 
 use image::{Rgb, RgbImage};
 
+use super::dataset::{Mask, Sample};
 use super::files::{lines, list_some, naming};
 use super::listing::{Frame, Loader};
 use super::mat::Record;
-use super::{Mask, Sample};
 use crate::depth::SparseDepth;
 use crate::depth::pixels::pixel_count;
 use crate::error::{Error, Result};

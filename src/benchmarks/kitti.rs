@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use super::Sample;
+use super::dataset::Sample;
 use super::files::{all_taken, depth, first_with, list, list_some, picture, take, unpaired};
 use super::listing::{Frame, Loader};
 use super::outliers::{THRESHOLD, WINDOW, remove_outliers};

@@ -1,6 +1,6 @@
 //! Frames that were listed when a data set was opened and are read one by one: what the loaders of files have in common.
 
-use super::{Dataset, Sample};
+use super::dataset::{Dataset, Sample};
 use crate::error::{Error, Result};
 
 /// A frame that was found and not yet read.

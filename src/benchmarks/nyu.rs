@@ -4,10 +4,10 @@ use std::path::{Path, PathBuf};
 
 use image::RgbImage;
 
+use super::dataset::{Dataset, Sample};
 use super::files::{Listed, list_some, naming};
 use super::hdf5::Numbers;
 use super::listing::entry;
-use super::{Dataset, Sample};
 use crate::depth::SparseDepth;
 use crate::error::{Error, Result};
 

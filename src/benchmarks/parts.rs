@@ -3,9 +3,9 @@
 use std::collections::HashMap;
 use std::path::Path;
 
+use super::dataset::{Dataset, Sample};
 use super::files::lines;
 use super::listing::entry;
-use super::{Dataset, Sample};
 use crate::error::{Error, Result};
 
 /// A data set whose ground truth counts only between two depths.

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use super::Sample;
+use super::dataset::Sample;
 use super::files::{
     PICTURES, all_taken, frame_name, list, list_some, naming, picture, recordings, take, unpaired,
 };

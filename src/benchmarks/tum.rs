@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use super::Sample;
+use super::dataset::Sample;
 use super::files::{below, depth, frame_name, lines, picture, recordings};
 use super::listing::{Frame, Loader};
 use crate::depth::DepthScale;

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use image::RgbImage;
 
-use super::Sample;
+use super::dataset::Sample;
 use super::files::{below, depth, frame_name, lines, naming, picture, same_size};
 use super::listing::{Frame, Loader};
 use crate::depth::io::png16;
