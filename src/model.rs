@@ -7,6 +7,7 @@ use crate::fusion::{Fusion, Normalise};
 use crate::kernels::{self, WeightFormat};
 use crate::query::prompt::Glimpse;
 use crate::query::{Prefix, PromptWriter, Settings};
+use crate::system;
 use crate::vlm::QwenVl;
 use crate::vlm::checkpoint::{CONFIG, PREPROCESSOR, Source, TOKENIZER, check_patches};
 use crate::vlm::config::VlmConfig;
@@ -140,7 +141,8 @@ impl Parts {
 /// How to load a checkpoint.
 #[derive(Debug, Clone)]
 pub struct LoadOptions {
-    /// Where its tensors shall lie.
+    /// Where its tensors shall lie. [`crate::system::device`] opens devices that may be used by several threads; one made with
+    /// candle's `Device::new_cuda` may not, and is refused.
     pub device: Device,
     /// In what form its matrices are kept. On the CPU, [`WeightFormat::Bf16`] takes half the memory of
     /// [`WeightFormat::F32`] and is faster; a published checkpoint loses nothing by it, since it is stored in bf16.
@@ -174,8 +176,12 @@ impl SdimModel {
     /// Builds the model; fails on missing or unread tensors.
     ///
     /// # Errors
-    /// [`Error::Config`] if the preprocessor's patches are not the model's; tensor and tokenizer errors.
+    /// [`Error::Config`] if the preprocessor's patches are not the model's; [`Error::Argument`] on a device or a format of weights
+    /// as for [`QwenVl::new`]; tensor and tokenizer errors.
     pub fn new(files: CheckpointFiles, weights: &Weights, device: &Device) -> Result<Self> {
+        for device in [device, weights.device()] {
+            system::check_order(device)?;
+        }
         let CheckpointFiles { config, preprocessor, settings, tokenizer, stop_ids } = files;
         check_patches(&preprocessor, &config)?;
         let prompts = PromptWriter::new(&settings, &tokenizer)?;

@@ -174,7 +174,8 @@ fn in_batches<T: Clone + Send>(
             for batch in members.chunks((plan.rows / rows.max(1)).max(1)) {
                 let asked: Vec<&Query> = batch.iter().map(|&i| &chunk[i]).collect();
                 let tokens: Vec<&Tokens> = batch.iter().map(|&i| &suffixes[i]).collect();
-                let answers = kernels::in_pool(|| answer(Batch::open(model, prefix, &asked, &tokens)?))?;
+                let read = || answer(Batch::open(model, prefix, &asked, &tokens)?);
+                let answers = kernels::in_pool(&model.device, read)?;
                 for (&i, a) in batch.iter().zip(answers) {
                     out[start + i] = a;
                 }

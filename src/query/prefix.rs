@@ -48,7 +48,7 @@ impl SdimModel {
                 let frame = MarkedFrame::new(self, marker, rgb, pixels, scattered)?;
                 Ok(Encoded::PerQuery(Box::new(frame)))
             }
-            _ => Ok(Encoded::Once(kernels::in_pool(|| self.encode(pixels, scattered))?)),
+            _ => Ok(Encoded::Once(kernels::in_pool(&self.device, || self.encode(pixels, scattered))?)),
         }
     }
 
@@ -69,7 +69,7 @@ impl SdimModel {
     pub fn read_encoded(&self, pixels: &Pixels, encoded: Encoded, sparse: &SparseDepth) -> Result<Prefix> {
         let frame = match encoded {
             Encoded::Once(tokens) => {
-                return kernels::in_pool(|| self.read_prefix(pixels, &tokens, sparse));
+                return kernels::in_pool(&self.device, || self.read_prefix(pixels, &tokens, sparse));
             }
             Encoded::PerQuery(frame) => *frame,
         };

@@ -186,7 +186,8 @@ impl Trainer {
         let mut stats = Vec::new();
         let frozen = self.step as f32 >= self.config.freeze_norm_at * self.config.steps as f32;
         // The next batch is rendered in the gaps of this one: much of a backward pass runs on one thread.
-        let (passes, next) = rayon::join(
+        let (passes, next) = kernels::join(
+            &self.model.device,
             || -> Result<_> {
                 let parts = self.loss(&examples, if frozen { None } else { Some(&mut stats) })?;
                 let grads = parts.total.backward()?;

@@ -30,7 +30,7 @@ pub mod weights;
 pub use answer::{Answer, AnswerOptions, ChatModel};
 
 use crate::error::Result;
-use crate::kernels;
+use crate::{kernels, system};
 use cache::KvCache;
 use candle_core::Tensor;
 use config::VlmConfig;
@@ -54,8 +54,11 @@ impl QwenVl {
     /// Builds both towers. The caller ends with [`Weights::finish`] when everything that reads them is built.
     ///
     /// # Errors
-    /// As [`Weights::get`].
+    /// As [`Weights::get`]; [`crate::Error::Argument`] on a device without one order of work for all threads
+    /// ([`crate::system::device`] opens those that have it), or a format of weights that it does not multiply.
     pub fn new(config: VlmConfig, weights: &Weights, layout: RopeLayout) -> Result<Self> {
+        system::check_order(weights.device())?;
+        weights.format().check(weights.device().location())?;
         let vision = VisionTower::new(&config.vision, weights)?;
         let decoder = Decoder::new(&config.text, weights, layout)?;
         Ok(Self { config, vision, decoder })
@@ -66,7 +69,8 @@ impl QwenVl {
     /// # Errors
     /// [`crate::Error::Tensors`] if the rows are not those of the grids.
     pub fn encode(&self, patches: &Tensor, grids: &[Grid]) -> Result<Tensor> {
-        kernels::in_pool(|| self.vision.encode(&self.vision.patch_embed.forward(patches)?, grids))
+        let vision = &self.vision;
+        kernels::in_pool(patches.device(), || vision.encode(&vision.patch_embed.forward(patches)?, grids))
     }
 
     /// Embeds a prompt and puts the image tokens in the places of the placeholders, in order: `[ids, hidden]`.
