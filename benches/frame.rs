@@ -16,7 +16,7 @@ fn frame(c: &mut Criterion) {
     let model = completer.model();
     let (pixels, scattered) = model.preprocess(&frame.rgb, &sparse).expect("a frame");
     let tokens = model.encode(&pixels, &scattered).expect("tokens");
-    let prefix = model.read_prefix(&pixels, &tokens, &sparse).expect("a prefix");
+    let prefix = model.prefill_prefix(&pixels, &tokens, &sparse).expect("a prefix");
     let queries: Vec<Query> =
         (0..4096).map(|i| Query { x: i * 7 % 640, y: i * 11 % 480, measured: None, hint: 2.0 }).collect();
 
@@ -33,7 +33,7 @@ fn frame(c: &mut Criterion) {
     });
     group.bench_function("vision", |b| b.iter(|| model.vlm.encode(&patches, &[pixels.grid])));
     group.bench_function("encode", |b| b.iter(|| model.encode(&pixels, &scattered)));
-    group.bench_function("prefill", |b| b.iter(|| model.read_prefix(&pixels, &tokens, &sparse)));
+    group.bench_function("prefill", |b| b.iter(|| model.prefill_prefix(&pixels, &tokens, &sparse)));
     group.bench_function("ask-4096", |b| b.iter(|| ask(model, &prefix, &queries, AskOptions::default())));
     let asked: Vec<Answered> = (0..160 * 120)
         .map(|i| Answered {

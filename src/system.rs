@@ -3,7 +3,11 @@
 use crate::error::{Error, Result};
 use candle_core::Device;
 
-/// Opens a device by its usual name: `cpu`, `cuda`, `cuda:N` or `metal`.
+/// CUDA's handle of the stream that each thread has its own of (`CU_STREAM_PER_THREAD`).
+const STREAM_PER_THREAD: usize = 2;
+
+/// Opens a device by its usual name: `cpu`, `cuda`, `cuda:N` or `metal`. One of CUDA has one stream, which does the work of all threads
+/// in the order in which it comes.
 ///
 /// # Errors
 /// [`Error::Argument`] on another name; [`Error::Tensors`] if this build or machine has no such device.
@@ -11,11 +15,47 @@ pub fn device(name: &str) -> Result<Device> {
     let index = |n: &str| n.parse().map_err(|_| Error::argument("device", name, "cpu, cuda:N or metal"));
     match name.split_once(':') {
         None if name == "cpu" => Ok(Device::Cpu),
-        None if name == "cuda" => Ok(Device::new_cuda(0)?),
+        None if name == "cuda" => Ok(Device::new_cuda_with_stream(0)?),
         None if name == "metal" => Ok(Device::new_metal(0)?),
-        Some(("cuda", n)) => Ok(Device::new_cuda(index(n)?)?),
+        Some(("cuda", n)) => Ok(Device::new_cuda_with_stream(index(n)?)?),
         _ => Err(Error::argument("device", name, "cpu, cuda:N or metal")),
     }
+}
+
+/// Refuses a device on which the work of one thread does not follow that of another: a model's weights are written by the thread that
+/// loads it, and may be read by any.
+///
+/// # Errors
+/// [`Error::Argument`] on a CUDA device that candle made with `Device::new_cuda`.
+pub(crate) fn check_order(device: &Device) -> Result<()> {
+    if has_one_order(stream(device)) {
+        return Ok(());
+    }
+    let found = format!("{:?} on the stream of each thread", device.location());
+    Err(Error::argument(
+        "device",
+        found,
+        "one of sdim::system::device or candle's Device::new_cuda_with_stream",
+    ))
+}
+
+/// `stream` is the handle of a CUDA stream. The other default stream, of handle 0 or 1, is one for all threads.
+fn has_one_order(stream: Option<usize>) -> bool {
+    stream != Some(STREAM_PER_THREAD)
+}
+
+/// Handle of the stream that a CUDA device works on.
+#[cfg(feature = "cuda")]
+fn stream(device: &Device) -> Option<usize> {
+    match device {
+        Device::Cuda(cuda) => Some(cuda.cuda_stream().cu_stream() as usize),
+        Device::Cpu | Device::Metal(_) => None,
+    }
+}
+
+#[cfg(not(feature = "cuda"))]
+fn stream(_: &Device) -> Option<usize> {
+    None
 }
 
 /// The largest resident memory of this process so far, bytes; `None` where the system does not tell (other than Linux).
@@ -29,6 +69,17 @@ pub fn peak_rss_bytes() -> Option<u64> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_stream_of_each_thread_is_refused() {
+        // As `cuda.h` numbers them: legacy default, the same by name, per thread, and the address of one of its own.
+        for (stream, good) in
+            [(None, true), (Some(0), true), (Some(1), true), (Some(2), false), (Some(0x7f00_1234), true)]
+        {
+            assert_eq!(has_one_order(stream), good, "{stream:?}");
+        }
+        assert!(check_order(&Device::Cpu).is_ok());
+    }
 
     #[test]
     fn devices_by_name() {

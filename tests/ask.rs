@@ -90,7 +90,7 @@ impl Checkpoint {
         let base = ["--model", text(self.dir.path()), "--image", text(&image), "--prompt", QUESTION];
         // A later flag of the same name replaces an earlier one only if it is told apart; so each is given once.
         let base = base.chunks(2).filter(|pair| !args.contains(&pair[0])).flatten().copied();
-        let mut command = Command::new(common::program("ask"));
+        let mut command = Command::new(common::program::program("ask"));
         command.args(base).args(args);
         command
     }

@@ -334,7 +334,7 @@ fn load_and_ask(checkpoint: &Checkpoint, and_ask: bool) -> bool {
         let (rgb, sparse) = tiny::frame(40, 30);
         let (pixels, scattered) = model.preprocess(&rgb, &sparse).unwrap();
         let tokens = model.encode(&pixels, &scattered).unwrap();
-        if let Ok(prefix) = model.read_prefix(&pixels, &tokens, &sparse) {
+        if let Ok(prefix) = model.prefill_prefix(&pixels, &tokens, &sparse) {
             let query = Query { x: 3, y: 4, measured: None, hint: 2.0 };
             let _ = ask(&model, &prefix, &[query], AskOptions::default());
         }

@@ -2,7 +2,8 @@
 
 mod common;
 
-use common::program;
+use common::program::program;
+use common::program::{FEATURES, Place};
 use serde_json::Value;
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
@@ -158,5 +159,37 @@ fn throughput_times_each_stage() {
     {
         let out = run("throughput", bad);
         assert!(!out.status.success() && out.stdout.is_empty(), "{bad:?}");
+    }
+}
+
+/// Programs are built with the features of the tests, so that all of them must be known.
+#[test]
+fn programs_are_built_with_every_feature_of_the_manifest() {
+    let manifest = include_str!("../Cargo.toml");
+    let section = manifest.split("\n[features]\n").nth(1).unwrap().split("\n[").next().unwrap();
+    let keys = section.lines().filter(|line| !line.starts_with('#'));
+    let mut named: Vec<&str> = keys.filter_map(|line| Some(line.split_once('=')?.0.trim())).collect();
+    let mut known: Vec<&str> = FEATURES.iter().map(|(name, _)| *name).collect();
+    named.sort();
+    known.sort();
+    assert_eq!(known, named);
+}
+
+#[test]
+fn a_test_knows_where_cargo_has_put_it() {
+    let dir = tempfile::tempdir().unwrap();
+    let place = |triple: Option<&str>, profile: &str| Place {
+        root: dir.path().into(),
+        triple: triple.map(String::from),
+        profile: profile.into(),
+    };
+    std::fs::write(dir.path().join(".rustc_info.json"), "{}").unwrap();
+    for (path, expected) in [
+        ("debug/deps/t-0", place(None, "dev")),
+        ("release/deps/t-0", place(None, "release")),
+        ("aarch64-unknown-linux-gnu/debug/deps/t-0", place(Some("aarch64-unknown-linux-gnu"), "dev")),
+        ("x86_64-pc-windows-msvc/thin/deps/t.exe", place(Some("x86_64-pc-windows-msvc"), "thin")),
+    ] {
+        assert_eq!(Place::of(&dir.path().join(path)), expected, "{path}");
     }
 }

@@ -50,7 +50,7 @@ fn run(model: &SdimModel, sparse: &SparseDepth) -> (Vec<u32>, Vec<u32>) {
     let (rgb, _) = tiny::frame(90, 70);
     let (pixels, scattered) = model.preprocess(&rgb, sparse).unwrap();
     let tokens = model.encode(&pixels, &scattered).unwrap();
-    let prefix = model.read_prefix(&pixels, &tokens, sparse).unwrap();
+    let prefix = model.prefill_prefix(&pixels, &tokens, sparse).unwrap();
     let queries: Vec<Query> =
         (0..20).map(|i| Query { x: i * 4, y: i * 3, measured: None, hint: 2.0 }).collect();
     let readings = ask(model, &prefix, &queries, AskOptions::default()).unwrap();

@@ -49,7 +49,7 @@ impl Setup {
         let (rgb, sparse): (RgbImage, SparseDepth) = tiny::frame(90, 70);
         let (pixels, scattered) = model.preprocess(&rgb, &sparse).unwrap();
         let image_tokens = model.encode(&pixels, &scattered).unwrap();
-        let prefix = model.read_prefix(&pixels, &image_tokens, &sparse).unwrap();
+        let prefix = model.prefill_prefix(&pixels, &image_tokens, &sparse).unwrap();
         let resized = (pixels.resized.width() as usize, pixels.resized.height() as usize);
         let (tokens, _) = model.prompts.prefix(&sparse, pixels.grid, resized, &model.vlm.config, 0).unwrap();
         let embedded = model.vlm.embed_prompt(&tokens.ids, &image_tokens).unwrap();
@@ -327,24 +327,24 @@ fn sequences_go_on_as_each_would_alone() {
         let positions: Vec<Position> = some.iter().flat_map(|s| s.positions.clone()).collect();
         let next = some.iter().map(|s| s.next_text(&setup.prefix.space)).collect();
         let (decoder, shared) = (&setup.model.vlm.decoder, Some(&setup.prefix.cache));
-        Sequences::read(decoder, shared, &setup.embed(&some), &positions, next).unwrap()
+        Sequences::prefill(decoder, shared, &setup.embed(&some), &positions, next).unwrap()
     };
     let mut all = read(&[0, 1, 2]);
     let ids = [3u32, 5, 4, 6];
-    all.go_on(&ids[..3]).unwrap();
+    all.decode_step(&ids[..3]).unwrap();
     all.keep(&[2, 0]).unwrap();
     assert_eq!((all.count(), all.last().dim(0).unwrap()), (2, 2));
     let before = all.last().clone();
-    all.go_on(&[ids[3], ids[0]]).unwrap();
+    all.decode_step(&[ids[3], ids[0]]).unwrap();
     for (row, (i, then)) in [(2, ids[3]), (0, ids[0])].into_iter().enumerate() {
         let mut alone = read(&[i]);
         for (id, together) in [(ids[i], &before), (then, all.last())] {
-            alone.go_on(&[id]).unwrap();
+            alone.decode_step(&[id]).unwrap();
             let difference = relative_difference(&together.narrow(0, row, 1).unwrap(), alone.last());
             assert!(difference <= TOLERANCE, "sequence {i}: {difference:.1e}");
         }
     }
-    assert!(matches!(all.go_on(&ids), Err(sdim::Error::Argument { name: "token ids", .. })));
+    assert!(matches!(all.decode_step(&ids), Err(sdim::Error::Argument { name: "token ids", .. })));
     assert!(all.keep(&[2]).is_err());
 }
 

@@ -154,10 +154,10 @@ impl Run {
                 (0..items).flat_map(|_| (0..args.suffix_tokens).map(|i| Position::text(next + i as f32)));
             let after = vec![next + args.suffix_tokens as f32; items];
             let (embedded, text) = (decoder.embed(&ids)?, text.collect::<Vec<_>>());
-            let mut sequences = Sequences::read(decoder, Some(prefix), &embedded, &text, after)?;
+            let mut sequences = Sequences::prefill(decoder, Some(prefix), &embedded, &text, after)?;
             for digit in 0..args.digits {
                 if digit > 0 {
-                    sequences.go_on(&ids)?;
+                    sequences.decode_step(&ids)?;
                 }
                 let logits = kernels::linear(sequences.last(), &rows, None)?;
                 let best = logits.argmax(1)?.to_vec1::<u32>()?;

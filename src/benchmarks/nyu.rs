@@ -12,11 +12,11 @@ use crate::depth::SparseDepth;
 use crate::error::{Error, Result};
 
 /// Size of a stored frame.
-const STORED: (usize, usize) = (640, 480);
+const STORED_SIZE: (usize, usize) = (640, 480);
 /// Size of a frame of the protocol.
-const CROP: (usize, usize) = (304, 228);
+const CROP_SIZE: (usize, usize) = (304, 228);
 /// What is cut off on the left and at the top of the 320 x 240 frame.
-const MARGIN: (usize, usize) = ((320 - CROP.0) / 2, (240 - CROP.1) / 2);
+const CROP_MARGIN: (usize, usize) = ((320 - CROP_SIZE.0) / 2, (240 - CROP_SIZE.1) / 2);
 
 /// The 654 official test frames at 304 x 228 pixels, in either of the forms in which they are passed around.
 ///
@@ -82,11 +82,13 @@ fn frames_of(file: &Numbers, name: &str, channels: usize) -> Result<usize> {
     let shape = file.shape(name)?;
     match shape[..] {
         // A frame takes more than a byte, however well it is compressed: a file cannot claim endless frames.
-        [frames, h, w, c] if (w, h) == CROP && c == channels && frames as u64 <= file.size() => Ok(frames),
-        _ => {
-            Err(file
-                .wrong(name, format!("shape {shape:?} instead of [N, {}, {}, {}]", CROP.1, CROP.0, channels)))
+        [frames, h, w, c] if (w, h) == CROP_SIZE && c == channels && frames as u64 <= file.size() => {
+            Ok(frames)
         }
+        _ => Err(file.wrong(
+            name,
+            format!("shape {shape:?} instead of [N, {}, {}, {}]", CROP_SIZE.1, CROP_SIZE.0, channels),
+        )),
     }
 }
 
@@ -128,21 +130,21 @@ impl Dataset for NyuDataset {
                 (rgb, gt, hints.as_ref().map(read).transpose()?)
             }
         };
-        let rgb = RgbImage::from_raw(CROP.0 as u32, CROP.1 as u32, rgb);
-        let expected = CROP.0 * CROP.1 * 3;
+        let rgb = RgbImage::from_raw(CROP_SIZE.0 as u32, CROP_SIZE.1 as u32, rgb);
+        let expected = CROP_SIZE.0 * CROP_SIZE.1 * 3;
         let rgb = rgb.ok_or(Error::BufferLength { what: "picture", expected, found: 0 })?;
         Ok(Sample { name: self.name(index), rgb, gt: gt.as_slice().to_vec(), sparse, masks: Vec::new() })
     }
 }
 
 fn cropped(depth: Vec<f32>, path: &Path) -> Result<SparseDepth> {
-    SparseDepth::new(CROP.0, CROP.1, depth).map_err(|e| naming(path, e))
+    SparseDepth::new(CROP_SIZE.0, CROP_SIZE.1, depth).map_err(|e| naming(path, e))
 }
 
 /// A frame's own file, halved and cropped: interleaved colours and depth.
 fn halved(path: &Path) -> Result<(Vec<u8>, Vec<f32>)> {
     let file = Numbers::open(path)?;
-    let (w, h) = STORED;
+    let (w, h) = STORED_SIZE;
     for (name, expected) in [("rgb", &[3, h, w][..]), ("depth", &[h, w])] {
         let shape = file.shape(name)?;
         if shape != expected {
@@ -150,7 +152,7 @@ fn halved(path: &Path) -> Result<(Vec<u8>, Vec<f32>)> {
         }
     }
     let planes = file.bytes("rgb", None)?;
-    let mut rgb = vec![0; CROP.0 * CROP.1 * 3];
+    let mut rgb = vec![0; CROP_SIZE.0 * CROP_SIZE.1 * 3];
     for (c, plane) in planes.chunks_exact(w * h).enumerate() {
         let half = half(plane, |[a, b, c, d]: [u8; 4]| {
             let [a, b, c, d] = [a, b, c, d].map(u16::from);
@@ -169,15 +171,15 @@ fn halved(path: &Path) -> Result<(Vec<u8>, Vec<f32>)> {
 
 /// The centre of half a plane: columns first, rounded to the plane's own type, then rows.
 fn half<T: Copy>(plane: &[T], weigh: impl Fn([T; 4]) -> T) -> Vec<T> {
-    let (top, left) = (2 * MARGIN.1 - 1, 2 * MARGIN.0 - 1);
-    let narrow: Vec<T> = (0..2 * CROP.1 + 2)
+    let (top, left) = (2 * CROP_MARGIN.1 - 1, 2 * CROP_MARGIN.0 - 1);
+    let narrow: Vec<T> = (0..2 * CROP_SIZE.1 + 2)
         .flat_map(|row| {
-            let row = &plane[(top + row) * STORED.0 + left..];
-            (0..CROP.0).map(move |x| [row[2 * x], row[2 * x + 1], row[2 * x + 2], row[2 * x + 3]])
+            let row = &plane[(top + row) * STORED_SIZE.0 + left..];
+            (0..CROP_SIZE.0).map(move |x| [row[2 * x], row[2 * x + 1], row[2 * x + 2], row[2 * x + 3]])
         })
         .map(&weigh)
         .collect();
-    let at = |x: usize, y: usize| narrow[y * CROP.0 + x];
-    let rows = (0..CROP.1).flat_map(|y| (0..CROP.0).map(move |x| (x, 2 * y)));
+    let at = |x: usize, y: usize| narrow[y * CROP_SIZE.0 + x];
+    let rows = (0..CROP_SIZE.1).flat_map(|y| (0..CROP_SIZE.0).map(move |x| (x, 2 * y)));
     rows.map(|(x, y)| weigh([at(x, y), at(x, y + 1), at(x, y + 2), at(x, y + 3)])).collect()
 }

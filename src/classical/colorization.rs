@@ -12,13 +12,13 @@ use crate::depth::{SparseDepth, interpolate};
 use crate::error::Result;
 
 /// Steps on the finest level; each coarser level, a quarter of the pixels, takes twice as many.
-const STEPS: usize = 40;
+const RELAXATION_STEPS: usize = 40;
 
 /// At most so many steps on a level.
 const MOST_STEPS: usize = 640;
 
 /// A level whose shorter side is at most this is solved without a coarser one.
-const COARSEST: usize = 6;
+const COARSEST_SIDE: usize = 6;
 
 /// Smallest variance of brightness (0 to 1): half a step of 8 bits, squared.
 const LEAST_VARIANCE: f32 = 0.25 / (255.0 * 255.0);
@@ -35,7 +35,7 @@ pub(super) fn complete(rgb: &RgbImage, sparse: &SparseDepth) -> Result<Vec<f32>>
         .pixels()
         .map(|&Rgb([r, g, b])| (0.299 * f32::from(r) + 0.587 * f32::from(g) + 0.114 * f32::from(b)) / 255.0);
     let level = Level { width: sparse.width(), height: sparse.height(), guide: brightness.collect(), known };
-    let solved = level.solve(STEPS)?;
+    let solved = level.solve(RELAXATION_STEPS)?;
     let metres = |(&v, &d): (&f32, &f32)| {
         if d.is_nan() { (low + (v - 1.0) * (high - low)).max(low).min(high) } else { d }
     };
@@ -53,7 +53,7 @@ struct Level {
 
 impl Level {
     fn solve(&self, steps: usize) -> Result<Vec<f32>> {
-        let mut values = if self.width.min(self.height) <= COARSEST {
+        let mut values = if self.width.min(self.height) <= COARSEST_SIDE {
             let known = SparseDepth::new(self.width, self.height, self.known.clone())?;
             interpolate::nearest(&known)?
         } else {
@@ -113,7 +113,8 @@ struct System {
     diagonal: Vec<f32>,
 }
 
-const AROUND: [(isize, isize); 8] = [(-1, -1), (0, -1), (1, -1), (-1, 0), (1, 0), (-1, 1), (0, 1), (1, 1)];
+const NEIGHBOUR_OFFSETS: [(isize, isize); 8] =
+    [(-1, -1), (0, -1), (1, -1), (-1, 0), (1, 0), (-1, 1), (0, 1), (1, 1)];
 
 impl System {
     fn new(level: &Level) -> Self {
@@ -126,7 +127,7 @@ impl System {
                 weights.iter_mut().zip(of_pixel).for_each(|(plane, w)| plane[here] = w);
             }
         }
-        let steps = AROUND.map(|(dx, dy)| dy * stride as isize + dx);
+        let steps = NEIGHBOUR_OFFSETS.map(|(dx, dy)| dy * stride as isize + dx);
         let mut system = Self { width, height, stride, weights, steps, diagonal: Vec::new() };
         system.diagonal = system.each_row(|start, line| {
             line.fill(1.0);
@@ -235,7 +236,7 @@ fn add(to: &mut [f32], times: f32, what: &[f32]) {
 /// outside the frame.
 fn similarity(level: &Level, x: usize, y: usize) -> [f32; 8] {
     let here = level.guide[y * level.width + x];
-    let guide = AROUND.map(|(dx, dy)| {
+    let guide = NEIGHBOUR_OFFSETS.map(|(dx, dy)| {
         let (x, y) = (x.checked_add_signed(dx)?, y.checked_add_signed(dy)?);
         (x < level.width && y < level.height).then(|| level.guide[y * level.width + x])
     });
@@ -273,7 +274,7 @@ mod tests {
         let term = |i: usize| {
             let weights = similarity(level, i % w, i / w);
             let mut difference = v[i];
-            for (weight, (dx, dy)) in weights.into_iter().zip(AROUND) {
+            for (weight, (dx, dy)) in weights.into_iter().zip(NEIGHBOUR_OFFSETS) {
                 let (x, y) = ((i % w) as isize + dx, (i / w) as isize + dy);
                 if (0..w as isize).contains(&x) && (0..h as isize).contains(&y) {
                     difference -= f64::from(weight) * v[y as usize * w + x as usize];
@@ -309,7 +310,7 @@ mod tests {
         for (i, known) in level.known.iter_mut().enumerate() {
             *known = if i % 211 == 7 { 1.0 + (i % w) as f32 / w as f32 } else { f32::NAN };
         }
-        let (quick, long) = (level.solve(STEPS).unwrap(), level.solve(3000).unwrap());
+        let (quick, long) = (level.solve(RELAXATION_STEPS).unwrap(), level.solve(3000).unwrap());
         let difference: f32 =
             quick.iter().zip(&long).map(|(a, b)| (a - b).abs()).sum::<f32>() / (w * h) as f32;
         // A picture of pure noise is the slowest there is.

@@ -140,7 +140,7 @@ impl DepthCompleter {
         seconds.encode = start.elapsed().as_secs_f64();
         let span = tracing::info_span!("prefill").entered();
         let mark = Instant::now();
-        let prefix = self.model.read_encoded(&pixels, encoded, sparse)?;
+        let prefix = self.model.prefill_encoded(&pixels, encoded, sparse)?;
         drop(span);
         seconds.prefill = mark.elapsed().as_secs_f64();
         let span = tracing::info_span!("queries").entered();

@@ -1,6 +1,6 @@
 //! The variables that the hub's Python library reads.
 
-use super::Hub;
+use super::settings::Hub;
 use crate::error::{Error, Result};
 use std::path::{Path, PathBuf};
 

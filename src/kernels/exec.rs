@@ -11,6 +11,8 @@ pub(super) fn on_cpu(tensors: &[&Tensor]) -> bool {
 
 /// The elements of a contiguous f32 CPU storage.
 pub(super) fn slice<'a>(storage: &'a CpuStorage, layout: &Layout) -> candle_core::Result<&'a [f32]> {
+    #[cfg(test)]
+    super::threads::witness::called();
     let all = storage.as_slice::<f32>()?;
     match layout.contiguous_offsets() {
         Some((start, end)) => Ok(&all[start..end]),
@@ -78,12 +80,6 @@ pub(super) unsafe fn written(len: usize, fill: impl FnOnce(&mut [f32])) -> Vec<f
         data.set_len(len);
     }
     data
-}
-
-/// Runs `f` on a thread of the pool. From any other, each parallel operation inside `f` would put its thread to sleep and
-/// wake it again, which costs more than a small operation.
-pub(crate) fn in_pool<R: Send>(f: impl FnOnce() -> R + Send) -> R {
-    rayon::scope(|_| f())
 }
 
 /// Rows in a chunk of work, so that a chunk holds about `elements` elements. Depends on the shape

@@ -41,6 +41,7 @@ mod rope;
 mod scale_shift;
 #[cfg(test)]
 mod testing;
+mod threads;
 mod vector;
 
 pub use activation::{gelu_erf, swiglu};
@@ -50,7 +51,7 @@ pub use attention::{AttentionLayout, Block, Precision, attention};
 pub use attention_shared::SharedKeys;
 pub use bins::{BinStats, bin_stats};
 pub use conv::conv3x3;
-pub(crate) use exec::{in_pool, read};
+pub(crate) use exec::read;
 pub use linear::linear;
 pub use memory::keep_freed_memory;
 pub use norm::rms_norm;
@@ -58,3 +59,6 @@ pub use packed::{PackedGate, PackedWeight, Rows, WeightFormat};
 pub use peak::peak_gflops;
 pub use rope::rope;
 pub use scale_shift::{affine_act, batch_norm_act};
+pub(crate) use threads::in_pool;
+#[cfg(feature = "train")]
+pub(crate) use threads::join;

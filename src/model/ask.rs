@@ -1,7 +1,7 @@
 //! Batches of per-pixel suffixes against one shared prefix.
 
 use super::batch::Batch;
-use super::generate::{Spoken, Voice};
+use super::generate::{FreeAnswer, TokenChooser};
 use super::prefix::Prefix;
 use super::sdim_model::SdimModel;
 use crate::error::{Error, Result};
@@ -16,9 +16,9 @@ use rayon::prelude::*;
 use std::collections::BTreeMap;
 
 /// Rows of one decoder pass, at most: large enough for efficient products, small enough for the caches.
-const ROWS: usize = 2048;
+const BATCH_ROWS: usize = 2048;
 /// Queries whose prompts are written at a time, so that memory does not grow with their number.
-const CHUNK: usize = 8 * ROWS;
+const QUERY_CHUNK: usize = 8 * BATCH_ROWS;
 
 /// How queries are asked.
 #[derive(Default)]
@@ -61,8 +61,8 @@ pub fn ask(
         }
         AnswerMode::Generate(generation) => {
             let grammar = AnswerGrammar::new(&model.prompts.settings().template, unit);
-            let spoken = speak(model, prefix, queries, generation, rows, progress)?;
-            spoken.par_iter().map(|s| s.reading(&grammar, &model.tokenizer)).collect()
+            let answers = answer_freely(model, prefix, queries, generation, rows, progress)?;
+            answers.par_iter().map(|s| s.reading(&grammar, &model.tokenizer)).collect()
         }
     }
 }
@@ -74,7 +74,7 @@ fn rows_within(model: &SdimModel, max_memory: Option<usize>) -> usize {
     let passing = 8 * t.hidden_size + 3 * t.intermediate_size;
     let kept = 2 * t.layers * t.kv_heads * t.head_dim();
     let bytes = (passing + kept).max(1) * size_of::<f32>();
-    max_memory.map_or(ROWS, |limit| (limit / bytes).clamp(1, ROWS))
+    max_memory.map_or(BATCH_ROWS, |limit| (limit / bytes).clamp(1, BATCH_ROWS))
 }
 
 /// Lets the model answer each query freely, token by token, and returns what it said, in the order of the queries.
@@ -87,24 +87,24 @@ pub fn generate(
     queries: &[Query],
     generation: &Generation,
     progress: &mut dyn FnMut(usize) -> bool,
-) -> Result<Vec<Spoken>> {
-    speak(model, prefix, queries, generation, ROWS, progress)
+) -> Result<Vec<FreeAnswer>> {
+    answer_freely(model, prefix, queries, generation, BATCH_ROWS, progress)
 }
 
-fn speak(
+fn answer_freely(
     model: &SdimModel,
     prefix: &Prefix,
     queries: &[Query],
     generation: &Generation,
     rows: usize,
     progress: &mut dyn FnMut(usize) -> bool,
-) -> Result<Vec<Spoken>> {
+) -> Result<Vec<FreeAnswer>> {
     let settings = model.prompts.settings();
     settings.validate_mode("answer mode", &AnswerMode::Generate(generation.clone()))?;
-    let voice = Voice::new(model, generation)?;
+    let chooser = TokenChooser::new(model, generation)?;
     let plan = Plan { forced: false, room: generation.max_new_tokens, rows };
-    in_batches(model, prefix, queries, plan, progress, Spoken::default(), &mut |mut batch| {
-        voice.speak(&mut batch)
+    in_batches(model, prefix, queries, plan, progress, FreeAnswer::default(), &mut |mut batch| {
+        chooser.answer_freely(&mut batch)
     })
 }
 
@@ -132,11 +132,11 @@ fn in_batches<T: Clone + Send>(
     let by_marker = matches!(model.prompts.settings().pixel_reference, PixelReference::Marker(_));
     if by_marker != prefix.marked.is_some() {
         let found = if by_marker { "a prefix with one image for all" } else { "a prefix of a marked frame" };
-        return Err(Error::argument("prefix", found, "one that SdimModel::read_frame of this model read"));
+        return Err(Error::argument("prefix", found, "one that SdimModel::prefill_frame of this model read"));
     }
     let mut out = vec![blank; queries.len()];
     let mut done = 0;
-    for (start, chunk) in (0..).step_by(CHUNK).zip(queries.chunks(CHUNK)) {
+    for (start, chunk) in (0..).step_by(QUERY_CHUNK).zip(queries.chunks(QUERY_CHUNK)) {
         let suffixes: Vec<Tokens> = chunk
             .par_iter()
             .map(|q| model.prompts.tokens(q, &prefix.space, &model.tokenizer, plan.forced))
@@ -153,7 +153,8 @@ fn in_batches<T: Clone + Send>(
             for batch in members.chunks((plan.rows / rows.max(1)).max(1)) {
                 let asked: Vec<&Query> = batch.iter().map(|&i| &chunk[i]).collect();
                 let tokens: Vec<&Tokens> = batch.iter().map(|&i| &suffixes[i]).collect();
-                let answers = kernels::in_pool(|| answer(Batch::open(model, prefix, &asked, &tokens)?))?;
+                let read = || answer(Batch::open(model, prefix, &asked, &tokens)?);
+                let answers = kernels::in_pool(&model.device, read)?;
                 for (&i, a) in batch.iter().zip(answers) {
                     out[start + i] = a;
                 }
@@ -196,6 +197,6 @@ fn forced_numbers(batch: &mut Batch) -> Result<Vec<Reading>> {
         if !open {
             return Ok(readers.iter().map(DigitReader::reading).collect());
         }
-        batch.sequences.go_on(&ids)?;
+        batch.sequences.decode_step(&ids)?;
     }
 }

@@ -52,7 +52,7 @@ impl<'a> Batch<'a> {
         let embedded = model.add_glimpses(embedded, &[(&prefix.image, &glimpses)])?;
         let next = suffixes.iter().map(|s| s.next_text(&prefix.space)).collect();
         let shared = Some(&prefix.cache);
-        let sequences = Sequences::read(&model.vlm.decoder, shared, &embedded, &positions, next)?;
+        let sequences = Sequences::prefill(&model.vlm.decoder, shared, &embedded, &positions, next)?;
         let suffixes = suffixes.iter().map(|s| s.ids.as_slice()).collect();
         Ok(Self { model, prefix, suffixes, sequences })
     }

@@ -14,11 +14,11 @@ use std::borrow::Cow;
 use std::ops::Range;
 
 /// Logits that are looked at in one piece, at most: 64 MiB in f32.
-const LOGITS: usize = 1 << 24;
+const LOGITS_PER_PASS: usize = 1 << 24;
 
 /// What the model said to one query.
 #[derive(Debug, Clone, PartialEq, Default)]
-pub struct Spoken {
+pub struct FreeAnswer {
     /// Token ids, without the one that ended it.
     pub ids: Vec<u32>,
     /// The probability of each of them among all tokens, after what stood before it.
@@ -30,7 +30,7 @@ pub struct Spoken {
 }
 
 /// How to choose the next token.
-pub(super) struct Voice<'a> {
+pub(super) struct TokenChooser<'a> {
     generation: &'a Generation,
     stop: Vec<u32>,
     /// Ids from this one on have no token.
@@ -45,7 +45,7 @@ struct Choice {
     digits: [f32; 10],
 }
 
-impl<'a> Voice<'a> {
+impl<'a> TokenChooser<'a> {
     pub(super) fn new(model: &SdimModel, generation: &'a Generation) -> Result<Self> {
         let numbers = model.prompts.numbers();
         let digits = match numbers.format {
@@ -63,9 +63,9 @@ impl<'a> Voice<'a> {
     }
 
     /// Answers of all items of a batch, each until it ends itself or has its most tokens.
-    pub(super) fn speak(&self, batch: &mut Batch) -> Result<Vec<Spoken>> {
+    pub(super) fn answer_freely(&self, batch: &mut Batch) -> Result<Vec<FreeAnswer>> {
         let mut alive: Vec<usize> = (0..batch.sequences.count()).collect();
-        let mut out = vec![Spoken::default(); alive.len()];
+        let mut out = vec![FreeAnswer::default(); alive.len()];
         loop {
             let choices = self.choose(batch, &alive, &out)?;
             let (mut ids, mut keep) = (Vec::new(), Vec::new());
@@ -92,15 +92,15 @@ impl<'a> Voice<'a> {
                 batch.keep(&keep)?;
                 alive = keep.into_iter().map(|row| alive[row]).collect();
             }
-            batch.sequences.go_on(&ids)?;
+            batch.sequences.decode_step(&ids)?;
         }
     }
 
-    fn choose(&self, batch: &Batch, alive: &[usize], out: &[Spoken]) -> Result<Vec<Option<Choice>>> {
+    fn choose(&self, batch: &Batch, alive: &[usize], out: &[FreeAnswer]) -> Result<Vec<Option<Choice>>> {
         let decoder = &batch.model.vlm.decoder;
         let vocab = decoder.config().vocab_size;
         let mut choices = Vec::with_capacity(alive.len());
-        let rows = (LOGITS / vocab).max(1);
+        let rows = (LOGITS_PER_PASS / vocab).max(1);
         for first in (0..alive.len()).step_by(rows) {
             let count = rows.min(alive.len() - first);
             let logits =
@@ -142,7 +142,7 @@ impl<'a> Voice<'a> {
     }
 }
 
-impl Spoken {
+impl FreeAnswer {
     /// The answer in words, special tokens left out.
     ///
     /// # Errors
@@ -245,10 +245,11 @@ mod tests {
     use crate::supervise::init::FreshFiles;
 
     /// A text of single bytes, all of them sure but for those given.
-    fn spoken(text: &str, unsure: &[(usize, f32)]) -> (Spoken, Tokenizer) {
+    fn spoken(text: &str, unsure: &[(usize, f32)]) -> (FreeAnswer, Tokenizer) {
         let tokenizer = FreshFiles::tiny(&Settings::paper()).unwrap().parse().unwrap().tokenizer;
         let ids = tokenizer.encode(text).unwrap();
-        let mut out = Spoken { probabilities: vec![1.0; ids.len()], ended: true, ids, ..Default::default() };
+        let mut out =
+            FreeAnswer { probabilities: vec![1.0; ids.len()], ended: true, ids, ..Default::default() };
         for (i, byte) in text.bytes().enumerate() {
             let p = unsure.iter().find(|u| u.0 == i).map_or(1.0, |u| u.1);
             out.probabilities[i] = p;

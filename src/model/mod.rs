@@ -18,7 +18,7 @@ pub use adapter::Adapter;
 pub use ask::{AskOptions, ask, generate};
 pub use encode::scatter;
 pub use files::{CheckpointFiles, SETTINGS, TENSORS};
-pub use generate::Spoken;
+pub use generate::FreeAnswer;
 #[cfg(feature = "tiny")]
 pub use load::tiny;
 pub use parts::DepthInjection;

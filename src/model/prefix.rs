@@ -48,7 +48,7 @@ impl SdimModel {
                 let frame = MarkedFrame::new(self, marker, rgb, pixels, scattered)?;
                 Ok(Encoded::PerQuery(Box::new(frame)))
             }
-            _ => Ok(Encoded::Once(kernels::in_pool(|| self.encode(pixels, scattered))?)),
+            _ => Ok(Encoded::Once(kernels::in_pool(&self.device, || self.encode(pixels, scattered))?)),
         }
     }
 
@@ -56,20 +56,20 @@ impl SdimModel {
     ///
     /// # Errors
     /// As [`SdimModel::preprocess`] and [`SdimModel::encode_frame`].
-    pub fn read_frame(&self, rgb: &RgbImage, sparse: &SparseDepth) -> Result<Prefix> {
+    pub fn prefill_frame(&self, rgb: &RgbImage, sparse: &SparseDepth) -> Result<Prefix> {
         let (pixels, scattered) = self.preprocess(rgb, sparse)?;
         let encoded = self.encode_frame(rgb, &pixels, &scattered)?;
-        self.read_encoded(&pixels, encoded, sparse)
+        self.prefill_encoded(&pixels, encoded, sparse)
     }
 
     /// Reads what all queries of an encoded frame share.
     ///
     /// # Errors
     /// [`crate::Error::Tensors`] on mismatched shapes.
-    pub fn read_encoded(&self, pixels: &Pixels, encoded: Encoded, sparse: &SparseDepth) -> Result<Prefix> {
+    pub fn prefill_encoded(&self, pixels: &Pixels, encoded: Encoded, sparse: &SparseDepth) -> Result<Prefix> {
         let frame = match encoded {
             Encoded::Once(tokens) => {
-                return kernels::in_pool(|| self.read_prefix(pixels, &tokens, sparse));
+                return kernels::in_pool(&self.device, || self.prefill_prefix(pixels, &tokens, sparse));
             }
             Encoded::PerQuery(frame) => *frame,
         };
@@ -90,7 +90,7 @@ impl SdimModel {
     ///
     /// # Errors
     /// [`crate::Error::Tensors`] on mismatched shapes.
-    pub fn read_prefix(
+    pub fn prefill_prefix(
         &self,
         pixels: &Pixels,
         image_tokens: &Tensor,

@@ -4,6 +4,7 @@ use super::files::CheckpointFiles;
 use super::parts::{DepthInjection, Parts};
 use crate::error::Result;
 use crate::query::PromptWriter;
+use crate::system;
 use crate::vlm::chat::tokenizer::Tokenizer;
 use crate::vlm::checkpoint::weights::Weights;
 use crate::vlm::files::check_patches;
@@ -39,8 +40,12 @@ impl SdimModel {
     /// Builds the model; fails on missing or unread tensors.
     ///
     /// # Errors
-    /// [`crate::Error::Config`] if the preprocessor's patches are not the model's; tensor and tokenizer errors.
+    /// [`crate::Error::Config`] if the preprocessor's patches are not the model's; [`crate::Error::Argument`] on a device or a format
+    /// of weights as for [`QwenVl::new`]; tensor and tokenizer errors.
     pub fn new(files: CheckpointFiles, weights: &Weights, device: &Device) -> Result<Self> {
+        for device in [device, weights.device()] {
+            system::check_order(device)?;
+        }
         let CheckpointFiles { config, preprocessor, settings, tokenizer, stop_ids } = files;
         check_patches(&preprocessor, &config)?;
         let prompts = PromptWriter::new(&settings, &tokenizer)?;

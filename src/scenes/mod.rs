@@ -49,7 +49,7 @@ impl RgbdFrame {
 }
 
 /// Largest side of a rendered frame, pixels.
-const LARGEST: usize = 8192;
+const LARGEST_SIDE: usize = 8192;
 
 /// A random scene: room, desk, table top, hall, heap of solids, street or yard, 0.1 m to some 100 m deep.
 ///
@@ -57,8 +57,8 @@ const LARGEST: usize = 8192;
 /// Fails with [`Error::Argument`] when a side is 0 or above 8192 pixels.
 pub fn procedural(seed: u64, width: usize, height: usize) -> Result<RgbdFrame> {
     for (name, side) in [("width", width), ("height", height)] {
-        if !(1..=LARGEST).contains(&side) {
-            return Err(Error::argument(name, side, format!("1 to {LARGEST} pixels")));
+        if !(1..=LARGEST_SIDE).contains(&side) {
+            return Err(Error::argument(name, side, format!("1 to {LARGEST_SIDE} pixels")));
         }
     }
     let mut rng = ChaCha8Rng::seed_from_u64(seed);

@@ -44,7 +44,7 @@ pub fn evaluate(model: &SdimModel, scenes: u64, points: usize, first_seed: u64) 
             .collect();
         let (pixels, scattered) = model.preprocess(&frame.rgb, &sparse)?;
         let tokens = model.encode(&pixels, &scattered)?;
-        let prefix = model.read_prefix(&pixels, &tokens, &sparse)?;
+        let prefix = model.prefill_prefix(&pixels, &tokens, &sparse)?;
         let answers = ask(model, &prefix, &queries, AskOptions::default())?;
         let (mut off, mut off_linear, mut depth) = (0.0, 0.0, 0.0);
         for (q, a) in queries.iter().zip(answers) {

@@ -9,8 +9,8 @@ use super::pass;
 use super::store::{self, Progress};
 use crate::error::{Error, Result};
 use crate::fusion::{BatchStats, Normalise};
-use crate::model::SETTINGS;
-use crate::model::SdimModel;
+use crate::kernels;
+use crate::model::{SETTINGS, SdimModel};
 use crate::query::number::{NumberFormat, Numbers, POINT};
 use crate::query::{AnswerMode, PixelReference, Settings};
 use crate::vlm::checkpoint::weights::Weights;
@@ -208,7 +208,8 @@ impl Trainer {
         let mut stats = Vec::new();
         let frozen = self.progress.step as f32 >= self.config.freeze_norm_at * self.config.steps as f32;
         // The next batch is rendered in the gaps of this one: much of a backward pass runs on one thread.
-        let (passes, next) = rayon::join(
+        let (passes, next) = kernels::join(
+            &self.model.device,
             || -> Result<_> {
                 let parts = self.loss(&examples, if frozen { None } else { Some(&mut stats) })?;
                 let grads = parts.total.backward()?;

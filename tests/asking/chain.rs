@@ -129,12 +129,12 @@ fn what_does_not_go_together_is_refused() {
     let settings = Settings { pixel_reference: PixelReference::Marker(large), ..by_marker() };
     let files = tiny::small_files(&settings);
     let model = tiny::model(&files, tiny::tensors(&files, 1));
-    let error = model.read_frame(&rgb, &sparse).err().unwrap();
+    let error = model.prefill_frame(&rgb, &sparse).err().unwrap();
     assert!(matches!(&error, Error::Config { key, .. } if key == "pixel_reference.size"), "{error}");
     // A prefix that was read without marks cannot be asked by marks.
     let (pixels, scattered) = model.preprocess(&rgb, &sparse).unwrap();
     let tokens = model.encode(&pixels, &scattered).unwrap();
-    let prefix = model.read_prefix(&pixels, &tokens, &sparse).unwrap();
+    let prefix = model.prefill_prefix(&pixels, &tokens, &sparse).unwrap();
     let query = Query { x: 1, y: 1, measured: None, hint: 1.0 };
     let error = ask(&model, &prefix, &[query], AskOptions::default()).unwrap_err();
     assert!(matches!(error, Error::Argument { name: "prefix", .. }), "{error}");

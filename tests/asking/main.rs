@@ -8,7 +8,7 @@ mod setup;
 
 use candle_core::Tensor;
 use common::{close, relative_difference, tiny};
-use sdim::internals::model::Spoken;
+use sdim::internals::model::FreeAnswer;
 use sdim::internals::query::Query;
 use sdim::internals::vlm::qwen2_5::decoder::Keep;
 use sdim::internals::vlm::qwen2_5::rope::Position;
@@ -104,13 +104,13 @@ fn free_answers_are_those_of_each_query_alone_and_end_one_by_one() {
     }
 }
 
-trait EqByIds<'a>: Iterator<Item = &'a Spoken> + Sized {
-    fn eq_by_ids(self, other: impl Iterator<Item = &'a Spoken>) -> bool {
+trait EqByIds<'a>: Iterator<Item = &'a FreeAnswer> + Sized {
+    fn eq_by_ids(self, other: impl Iterator<Item = &'a FreeAnswer>) -> bool {
         self.map(|s| &s.ids).eq(other.map(|s| &s.ids))
     }
 }
 
-impl<'a, I: Iterator<Item = &'a Spoken>> EqByIds<'a> for I {}
+impl<'a, I: Iterator<Item = &'a FreeAnswer>> EqByIds<'a> for I {}
 
 #[test]
 fn free_answers_follow_a_pointer_and_mind_the_penalty() {

@@ -4,7 +4,7 @@ use crate::common::tiny;
 use candle_core::Tensor;
 use image::RgbImage;
 use sdim::SparseDepth;
-use sdim::internals::model::{AskOptions, Prefix, SdimModel, Spoken, ask, generate};
+use sdim::internals::model::{AskOptions, FreeAnswer, Prefix, SdimModel, ask, generate};
 use sdim::internals::query::number::DigitReader;
 use sdim::internals::query::{Query, Reading};
 use sdim::internals::vlm::qwen2_5::decoder::Keep;
@@ -53,7 +53,7 @@ impl Setup {
 
     pub fn of(model: SdimModel) -> Self {
         let (rgb, sparse) = tiny::frame(90, 70);
-        let prefix = model.read_frame(&rgb, &sparse).unwrap();
+        let prefix = model.prefill_frame(&rgb, &sparse).unwrap();
         Self { model, rgb, sparse, prefix }
     }
 
@@ -145,7 +145,7 @@ impl Setup {
         (answer, false)
     }
 
-    pub fn speak(&self, queries: &[Query], generation: &Generation) -> Vec<Spoken> {
+    pub fn speak(&self, queries: &[Query], generation: &Generation) -> Vec<FreeAnswer> {
         generate(&self.model, &self.prefix, queries, generation, &mut |_| true).unwrap()
     }
 

@@ -2,6 +2,7 @@
 //! the examples' programs.
 #![allow(dead_code)]
 
+pub mod program;
 pub mod random;
 pub mod tiny;
 
@@ -10,7 +11,6 @@ use sdim::internals::query::Reading;
 use std::cell::RefCell;
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::path::{Path, PathBuf};
-use std::process::Command;
 
 /// Largest accepted difference, relative to the largest magnitude of the golden tensor. Rounding noise of f32 stays
 /// under 3e-5; each of the mistakes that one can make in this architecture shows at 8e-4 or more.
@@ -199,25 +199,6 @@ pub fn relative_difference(ours: &Tensor, wanted: &Tensor) -> f64 {
     let largest = wanted.iter().fold(0f32, |m, v| m.max(v.abs()));
     let difference = ours.iter().zip(&wanted).fold(0f32, |m, (a, b)| m.max((a - b).abs()));
     if difference == 0.0 { 0.0 } else { f64::from(difference) / f64::from(largest) }
-}
-
-/// The example's program, built if `cargo test` was asked for this test alone.
-pub fn program(name: &str) -> PathBuf {
-    let test = std::env::current_exe().unwrap();
-    let profile = test.parent().unwrap().parent().unwrap();
-    let path = profile.join("examples").join(format!("{name}{}", std::env::consts::EXE_SUFFIX));
-    if !path.exists() {
-        let mut cargo = Command::new(env!("CARGO"));
-        cargo.args(["build", "--example", name]).current_dir(env!("CARGO_MANIFEST_DIR"));
-        if cfg!(feature = "hub") {
-            cargo.args(["--features", "hub"]);
-        }
-        if profile.ends_with("release") {
-            cargo.arg("--release");
-        }
-        assert!(cargo.status().unwrap().success());
-    }
-    path
 }
 
 fn values(tensor: &Tensor) -> Vec<f32> {

@@ -8,7 +8,7 @@ mod running;
 mod scores;
 mod skipped;
 
-use common::program;
+use common::program::program;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};

@@ -1,6 +1,6 @@
 //! Resuming, shards, settings, figures, bad arguments.
 
-use crate::common::program;
+use crate::common::program::program;
 use crate::{Folder, results, said, succeeded, text};
 use std::fs;
 use std::path::PathBuf;

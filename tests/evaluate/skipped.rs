@@ -1,6 +1,6 @@
 //! Frames without valid depth, and damaged ones.
 
-use crate::common::program;
+use crate::common::program::program;
 use crate::{Folder, results, said, succeeded, text};
 use sdim::depth::io;
 use serde_json::{Value, json};

@@ -3,7 +3,7 @@
 use super::super::level::Level;
 use super::isa;
 use crate::error::{Error, Result};
-use candle_core::Device;
+use candle_core::{Device, DeviceLocation};
 
 /// How the weights of a model are held in memory.
 ///
@@ -32,6 +32,8 @@ pub enum WeightFormat {
     /// A channel far above the others therefore costs those their precision: in a row of 2048, what the others add up to is off by 0.6 %
     /// without one, by 4.3 % beside one of 10 times their range, by 37 % beside one of 100 times (bf16: 0.2, 0.2 and 0.6 %). Trained language
     /// models have such channels and random ones do not: measure a checkpoint in this format before relying on it.
+    ///
+    /// On the CPU alone: a model that is loaded in this format on another device is an error.
     Int8,
 }
 
@@ -43,6 +45,20 @@ impl WeightFormat {
             Self::Bf16
         } else {
             Self::F32
+        }
+    }
+
+    /// Whether matrices that lie there can be held in this form.
+    ///
+    /// # Errors
+    /// [`Error::Argument`] if not: nothing else is held in its place.
+    pub(crate) fn check(self, location: DeviceLocation) -> Result<()> {
+        match (self, location) {
+            (Self::F32 | Self::Bf16, _) | (Self::Int8, DeviceLocation::Cpu) => Ok(()),
+            (Self::Int8, DeviceLocation::Cuda { .. } | DeviceLocation::Metal { .. }) => {
+                let expected = "f32 or bf16 there; bytes are multiplied on the CPU alone";
+                Err(Error::argument("weight format", format!("int8 on {location:?}"), expected))
+            }
         }
     }
 }
@@ -81,6 +97,19 @@ mod tests {
             assert_eq!(format.to_string().parse::<WeightFormat>().unwrap(), format);
         }
         assert!("f64".parse::<WeightFormat>().is_err());
+    }
+
+    #[test]
+    fn bytes_are_for_the_cpu_alone() {
+        use WeightFormat::{Bf16, F32, Int8};
+        for location in [DeviceLocation::Cuda { gpu_id: 1 }, DeviceLocation::Metal { gpu_id: 0 }] {
+            for format in [F32, Bf16] {
+                assert!(format.check(location).is_ok(), "{format} on {location:?}");
+            }
+            let error = Int8.check(location).unwrap_err();
+            assert!(matches!(error, Error::Argument { name: "weight format", .. }), "{error}");
+        }
+        assert!([F32, Bf16, Int8].iter().all(|format| format.check(DeviceLocation::Cpu).is_ok()));
     }
 
     #[test]

@@ -178,7 +178,7 @@ impl QwenVl {
         let mut answer: Vec<u32> = Vec::new();
         while answer.len() < options.max_new_tokens {
             if let Some(&id) = answer.last() {
-                sequence.go_on(&[id])?;
+                sequence.decode_step(&[id])?;
             }
             let logits = self.decoder.logits(sequence.last())?.squeeze(0)?;
             let usable = options.usable_vocab.min(logits.dim(0)?);

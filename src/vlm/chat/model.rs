@@ -18,7 +18,7 @@ use image::RgbImage;
 use std::path::Path;
 
 /// Logits that an [`Answer`] keeps of its first token.
-const TOP: usize = 20;
+const TOP_LOGITS: usize = 20;
 
 /// A published Qwen2.5-VL checkpoint, or a fine-tune of one, to talk to. Immutable: share it by `Arc`.
 ///
@@ -234,7 +234,7 @@ fn check_placeholder(source: &Source, tokenizer: &Tokenizer, config: &VlmConfig)
 fn top(logits: &[f32]) -> Vec<(u32, f32)> {
     let mut all: Vec<(u32, f32)> = (0..).zip(logits.iter().copied()).collect();
     all.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.0.cmp(&b.0)));
-    all.truncate(TOP);
+    all.truncate(TOP_LOGITS);
     all
 }
 
@@ -246,7 +246,7 @@ mod tests {
     fn the_highest_logits_come_first() {
         assert_eq!(top(&[1.0, 3.0, -2.0, 3.0]), [(1, 3.0), (3, 3.0), (0, 1.0), (2, -2.0)]);
         let many: Vec<f32> = (0..100).map(|i| i as f32).collect();
-        assert_eq!(top(&many).len(), TOP);
+        assert_eq!(top(&many).len(), TOP_LOGITS);
         assert_eq!(top(&many)[0], (99, 99.0));
     }
 }

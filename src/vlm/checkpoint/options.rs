@@ -15,7 +15,8 @@ use std::path::PathBuf;
 #[derive(Debug, Clone)]
 #[non_exhaustive]
 pub struct LoadOptions {
-    /// Where its tensors shall lie.
+    /// Where its tensors shall lie. [`crate::system::device`] opens devices that may be used by several threads; one made with
+    /// candle's `Device::new_cuda` may not, and is refused.
     pub device: Device,
     /// In what form its matrices are kept. On the CPU, [`WeightFormat::Bf16`] takes half the memory of
     /// [`WeightFormat::F32`] and is faster; a published checkpoint loses nothing by it, since it is stored in bf16.

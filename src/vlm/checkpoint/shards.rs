@@ -35,6 +35,12 @@ pub(crate) fn shard_names(index: &Path) -> Result<BTreeSet<String>> {
     Ok(weight_map(index)?.into_values().collect())
 }
 
+/// Names of the tensors that an index has.
+#[cfg(feature = "hub")]
+pub(crate) fn tensor_names(index: &Path) -> Result<Vec<String>> {
+    Ok(weight_map(index)?.into_keys().collect())
+}
+
 impl Weights {
     /// The tensors of a checkpoint directory: `model.safetensors`, or the shards that
     /// `model.safetensors.index.json` names.

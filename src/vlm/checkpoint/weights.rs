@@ -93,9 +93,10 @@ impl Weights {
         }
     }
 
-    /// Tensors that are already in memory (the trainer's variables, tests). `file` is for messages.
+    /// Tensors that are already in memory, all on one device (the trainer's variables, tests). `file` is for messages.
     pub fn from_tensors(file: &str, tensors: HashMap<String, Tensor>) -> Self {
-        let mut weights = Self::empty(file, &Device::Cpu);
+        let device = tensors.values().next().map_or(Device::Cpu, |tensor| tensor.device().clone());
+        let mut weights = Self::empty(file, &device);
         weights.sources = tensors.into_iter().map(|(name, t)| (name, Source::Tensor(t))).collect();
         weights
     }

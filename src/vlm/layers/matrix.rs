@@ -28,7 +28,8 @@ impl Matrix {
     /// Keeps a f32 tensor in a format.
     ///
     /// # Errors
-    /// [`Error::Tensors`] if it has not two dimensions or the device refuses it; [`Error::Argument`] for what int8 cannot hold.
+    /// [`Error::Tensors`] if it has not two dimensions or the device refuses it; [`Error::Argument`] for what int8 cannot hold,
+    /// and for int8 on another device than the CPU.
     pub fn from_tensor(tensor: &Tensor, format: WeightFormat) -> Result<Self> {
         tensor.dims2()?;
         Self::new(&Raw::Tensor(tensor.clone()), format, tensor.device())
@@ -39,6 +40,8 @@ impl Matrix {
         if raw.packs(format, device) {
             return Ok(Self::Packed(Arc::new(raw::pack(&[raw], format)?)));
         }
+        let place = if let Raw::Tensor(tensor) = raw { tensor.device() } else { device };
+        format.check(place.location())?;
         Ok(Self::Plain(match (format, raw) {
             (WeightFormat::F32, _) | (_, Raw::Absent(_)) => raw.f32(device)?,
             // Half as much goes to the device.

@@ -263,7 +263,7 @@ impl Decoder {
             }
             Context::Cached { own, .. } => self.kept(keep, table, &layout, own.items(), rows)?,
         };
-        let x = kernels::in_pool(|| -> Result<Tensor> {
+        let x = kernels::in_pool(embedded.device(), || -> Result<Tensor> {
             let mut x = embedded.clone();
             for (i, layer) in self.layers.iter().enumerate() {
                 let kept = kept.as_ref().filter(|_| i + 1 == self.layers.len());

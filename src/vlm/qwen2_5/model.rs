@@ -7,8 +7,8 @@ use super::grid::Grid;
 use super::rope::{Position, RopeLayout};
 use super::vision::VisionTower;
 use crate::error::{Error, Result};
-use crate::kernels;
 use crate::vlm::checkpoint::weights::Weights;
+use crate::{kernels, system};
 use candle_core::Tensor;
 
 /// The published model: vision encoder and decoder.
@@ -25,8 +25,11 @@ impl QwenVl {
     /// Builds both towers. The caller ends with [`Weights::finish`] when everything that reads them is built.
     ///
     /// # Errors
-    /// As [`Weights::get`].
+    /// As [`Weights::get`]; [`Error::Argument`] on a device without one order of work for all threads
+    /// ([`crate::system::device`] opens those that have it), or a format of weights that it does not multiply.
     pub fn new(config: VlmConfig, weights: &Weights, layout: RopeLayout) -> Result<Self> {
+        system::check_order(weights.device())?;
+        weights.format().check(weights.device().location())?;
         let vision = VisionTower::new(&config.vision, weights)?;
         let decoder = Decoder::new(&config.text, weights, layout)?;
         Ok(Self { config, vision, decoder })
@@ -37,7 +40,8 @@ impl QwenVl {
     /// # Errors
     /// [`crate::Error::Tensors`] if the rows are not those of the grids.
     pub fn encode(&self, patches: &Tensor, grids: &[Grid]) -> Result<Tensor> {
-        kernels::in_pool(|| self.vision.encode(&self.vision.patch_embed.forward(patches)?, grids))
+        let vision = &self.vision;
+        kernels::in_pool(patches.device(), || vision.encode(&vision.patch_embed.forward(patches)?, grids))
     }
 
     /// Embeds a prompt and puts the image tokens in the places of the placeholders, in order: `[ids, hidden]`.

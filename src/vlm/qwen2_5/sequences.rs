@@ -1,4 +1,4 @@
-//! Sequences that are read together and go on together, token by token.
+//! Sequences that are prefilled together and decoded together, token by token.
 
 use super::cache::KvCache;
 use super::decoder::{Context, Decoder, Keep};
@@ -6,9 +6,9 @@ use super::rope::Position;
 use crate::error::{Error, Result};
 use candle_core::Tensor;
 
-/// Sequences of equal length, each of which sees one shared context and itself: answers under way.
+/// Sequences of equal length, each of which sees one shared context and itself: answers in progress.
 ///
-/// Sequences do not see each other: each goes on as it would alone.
+/// Sequences do not see each other: each is decoded as it would be alone.
 pub struct Sequences<'a> {
     decoder: &'a Decoder,
     shared: Option<&'a KvCache>,
@@ -19,12 +19,12 @@ pub struct Sequences<'a> {
 }
 
 impl<'a> Sequences<'a> {
-    /// Reads `embedded`, `[sequences * tokens, hidden]` with one position per row; `next` holds the text position that follows
+    /// Prefills `embedded`, `[sequences * tokens, hidden]` with one position per row; `next` holds the text position that follows
     /// each sequence. `shared` is what all of them see before themselves.
     ///
     /// # Errors
     /// As [`Decoder::forward`].
-    pub fn read(
+    pub fn prefill(
         decoder: &'a Decoder,
         shared: Option<&'a KvCache>,
         embedded: &Tensor,
@@ -36,7 +36,7 @@ impl<'a> Sequences<'a> {
         Ok(Self { decoder, shared, own, next, last })
     }
 
-    /// One sequence that goes on where `shared` ends and has read nothing of its own yet: `last` is the normed hidden state of
+    /// One sequence that continues where `shared` ends and has no token of its own yet: `last` is the normed hidden state of
     /// the last token there, `[1, hidden]`, and `next` the text position that follows.
     pub fn after(decoder: &'a Decoder, shared: &'a KvCache, last: Tensor, next: f32) -> Self {
         Self { decoder, shared: Some(shared), own: decoder.cache(1), next: vec![next], last }
@@ -52,12 +52,12 @@ impl<'a> Sequences<'a> {
         &self.last
     }
 
-    /// Reads one more text token of each sequence.
+    /// One decode step: feeds one more text token to each sequence.
     ///
     /// # Errors
-    /// After an error in the middle of a pass the sequences cannot go on.
+    /// After an error in the middle of a pass the sequences cannot be decoded further.
     /// [`Error::Argument`] on an id outside the vocabulary, or if there is not one for each sequence.
-    pub fn go_on(&mut self, ids: &[u32]) -> Result<()> {
+    pub fn decode_step(&mut self, ids: &[u32]) -> Result<()> {
         if ids.len() != self.count() {
             let expected = format!("{}, one for each sequence", self.count());
             return Err(Error::argument("token ids", ids.len(), expected));
@@ -68,7 +68,7 @@ impl<'a> Sequences<'a> {
         Ok(())
     }
 
-    /// Goes on with these sequences only, in this order.
+    /// Keeps these sequences only, in this order.
     ///
     /// # Errors
     /// [`Error::Argument`] if an index is out of range; nothing has changed then.

@@ -17,7 +17,7 @@ use candle_core::{Device, Tensor};
 use std::ops::Range;
 
 /// The reference hard-codes this value; the config's `rms_norm_eps` is the decoder's.
-const EPS: f64 = 1e-6;
+const NORM_EPS: f64 = 1e-6;
 
 struct VisionBlock {
     norm1: RmsNorm,
@@ -31,10 +31,10 @@ impl VisionBlock {
     fn new(c: &VisionConfig, weights: &Weights, index: usize) -> Result<Self> {
         let (d, name) = (c.hidden_size, format!("visual.blocks.{index}"));
         Ok(Self {
-            norm1: RmsNorm::new(weights, &format!("{name}.norm1"), d, EPS)?,
+            norm1: RmsNorm::new(weights, &format!("{name}.norm1"), d, NORM_EPS)?,
             qkv: Linear::new(weights, &format!("{name}.attn.qkv"), d, 3 * d, true)?,
             proj: Linear::new(weights, &format!("{name}.attn.proj"), d, d, true)?,
-            norm2: RmsNorm::new(weights, &format!("{name}.norm2"), d, EPS)?,
+            norm2: RmsNorm::new(weights, &format!("{name}.norm2"), d, NORM_EPS)?,
             mlp: GatedMlp::new(weights, &format!("{name}.mlp"), d, c.intermediate_size, true)?,
         })
     }
@@ -121,7 +121,7 @@ impl VisionTower {
         Ok(Self {
             patch_embed: PatchEmbed::new(config, weights, "visual.patch_embed.proj")?,
             blocks: (0..config.depth).map(|i| VisionBlock::new(config, weights, i)).collect::<Result<_>>()?,
-            ln_q: RmsNorm::new(weights, "visual.merger.ln_q", config.hidden_size, EPS)?,
+            ln_q: RmsNorm::new(weights, "visual.merger.ln_q", config.hidden_size, NORM_EPS)?,
             mlp0: Linear::new(weights, "visual.merger.mlp.0", merged, merged, true)?,
             mlp2: Linear::new(weights, "visual.merger.mlp.2", merged, config.out_hidden_size, true)?,
             precision: weights.format().into(),
