@@ -12,49 +12,23 @@
 //!
 //! This module knows nothing of images or depth, and is the only home of `unsafe` in the crate.
 
-mod activation;
-mod adamw;
-mod add;
 mod attention;
-mod attention_bf16;
-mod attention_composed;
-mod attention_cpu;
-mod attention_plan;
-mod attention_rows;
-mod attention_shared;
-#[cfg(test)]
-mod attention_tests;
-mod attention_tile;
-mod bins;
-mod conv;
 mod exec;
-mod level;
-mod linear;
-mod math;
+mod gemm;
+mod isa;
 mod memory;
-mod norm;
-mod packed;
-mod panels;
+mod ops;
 mod peak;
-mod product;
-mod rope;
-mod scale_shift;
+mod simd;
 #[cfg(test)]
 mod testing;
-mod vector;
 
-pub use activation::{gelu_erf, swiglu};
-pub use adamw::adamw_step;
-pub use add::add;
-pub use attention::{AttentionLayout, Block, Precision, attention};
-pub use attention_shared::SharedKeys;
-pub use bins::{BinStats, bin_stats};
-pub use conv::conv3x3;
+pub use attention::{AttentionLayout, Block, Precision, SharedKeys, attention};
 pub(crate) use exec::{in_pool, read};
-pub use linear::linear;
+pub use gemm::packed::{PackedGate, PackedWeight, Rows, WeightFormat};
 pub use memory::keep_freed_memory;
-pub use norm::rms_norm;
-pub use packed::{PackedGate, PackedWeight, Rows, WeightFormat};
+pub use ops::{
+    BinStats, adamw_step, add, affine_act, batch_norm_act, bin_stats, conv3x3, gelu_erf, linear, rms_norm,
+    rope, swiglu,
+};
 pub use peak::peak_gflops;
-pub use rope::rope;
-pub use scale_shift::{affine_act, batch_norm_act};

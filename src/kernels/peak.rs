@@ -1,8 +1,8 @@
 //! What the multipliers of this machine can do when nothing has to come from memory.
 
-use super::level::Level;
-use super::packed::WeightFormat;
-use super::vector::{Baseline, Vector};
+use crate::kernels::gemm::packed::WeightFormat;
+use crate::kernels::isa::level::Level;
+use crate::kernels::simd::vector::{Baseline, Vector};
 use rayon::prelude::*;
 use std::time::Instant;
 
@@ -32,7 +32,7 @@ fn once(format: WeightFormat) -> usize {
         use std::arch::x86_64::{__m256, __m512};
         if level.is_amx() && format != WeightFormat::F32 {
             // SAFETY: a `Level` says AMX only where the unit was found and checked.
-            return unsafe { super::packed::amx_busy(format, STEPS / 16) };
+            return unsafe { crate::kernels::gemm::packed::amx_busy(format, STEPS / 16) };
         }
         if level.is_avx512() {
             // SAFETY: a `Level` says AVX-512 only where the CPU reported it; the extensions are asked for here.
@@ -91,7 +91,7 @@ unsafe fn floats<V: Vector>() -> usize {
 #[cfg(target_arch = "aarch64")]
 mod neon {
     use super::{STEPS, SUMS};
-    use crate::kernels::packed::neon::{bfdot, sdot};
+    use crate::kernels::gemm::packed::neon::{bfdot, sdot};
     use std::arch::aarch64::*;
 
     #[target_feature(enable = "neon,bf16")]

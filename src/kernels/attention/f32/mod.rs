@@ -1,0 +1,4 @@
+//! Attention in f32, with gradients.
+
+pub(in crate::kernels) mod op;
+pub(in crate::kernels) mod tile;

@@ -1,0 +1,4 @@
+//! Matrix products of f32.
+
+pub(in crate::kernels) mod panels;
+pub(in crate::kernels) mod product;

@@ -1,0 +1,3 @@
+//! Instruction sets: which ones the machine has, and functions compiled for each.
+
+pub(in crate::kernels) mod level;
