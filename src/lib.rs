@@ -4,6 +4,7 @@
     doc = "Dense metric depth from an RGB frame and sparse depth, by asking a VLM."
 )]
 #![deny(missing_docs)]
+#![deny(unsafe_code)]
 #![deny(unsafe_op_in_unsafe_fn)]
 #![warn(clippy::all)]
 
@@ -18,6 +19,7 @@ pub mod frame;
 pub mod fusion;
 #[cfg(feature = "hub")]
 pub mod hub;
+#[allow(unsafe_code)]
 pub mod kernels;
 pub mod model;
 pub mod query;

@@ -6,9 +6,12 @@
 //! composed from candle operations.
 //!
 //! The environment variable `SDIM_KERNEL` forces one instruction set, if the machine has it: `portable`; `avx2`, `avx512` or
-//! `amx` on x86-64; `neon` on 64-bit Arm. It is read once, at the first call. (AMX multiplies packed weights only; with
-//! it, everything else uses AVX-512. The dot products of AVX-512, AVX2 and NEON, of bf16 and of bytes, are used at these levels where
-//! the machine has them.)
+//! `amx` on x86-64; `neon` on 64-bit Arm. It is read once, at the first call. The dot products of AVX-512, AVX2 and NEON, of bf16 and of
+//! bytes, are used at these levels where the machine has them. AMX multiplies packed weights only, with AVX-512 for everything else, and
+//! is never chosen where it is not asked for: it has not run on hardware yet.
+//!
+//! From the bottom up: `isa` finds the instruction sets and compiles functions for them, `simd` has their registers; `gemm` multiplies
+//! matrices; `attention` and `ops` are what layers call. `exec` and `written` reach tensors' data and make results.
 //!
 //! This module knows nothing of images or depth, and is the only home of `unsafe` in the crate.
 
@@ -22,13 +25,14 @@ mod peak;
 mod simd;
 #[cfg(test)]
 mod testing;
+mod written;
 
 pub use attention::{AttentionLayout, Block, Precision, SharedKeys, attention};
 pub(crate) use exec::{in_pool, read};
-pub use gemm::packed::{PackedGate, PackedWeight, Rows, WeightFormat};
+pub use gemm::packed::{PackedGate, PackedWeight, RowMajor, WeightFormat};
 pub use memory::keep_freed_memory;
 pub use ops::{
-    BinStats, adamw_step, add, affine_act, batch_norm_act, bin_stats, conv3x3, gelu_erf, linear, rms_norm,
-    rope, swiglu,
+    AdamWStep, BinStats, adamw_step, add, affine_act, batch_norm_act, bin_stats, conv3x3, gelu_erf, linear,
+    packed_mlp, rms_norm, rope, swiglu,
 };
 pub use peak::peak_gflops;

@@ -1,10 +1,12 @@
 //! Attention composed from candle operations, for devices and types without a kernel of ours.
 
+use super::layout::{AttentionLayout, Block};
 use crate::error::Result;
-use crate::kernels::attention::layout::{AttentionLayout, Block};
+
 use candle_core::{D, DType, Device, Tensor};
 
-pub(in crate::kernels) fn composed(
+/// [`attention()`](super::attention) of tensors that fit the layout, `shared` being the extra pair.
+pub(super) fn composed(
     q: &Tensor,
     k: &Tensor,
     v: &Tensor,
@@ -20,7 +22,7 @@ pub(in crate::kernels) fn composed(
         if block.queries.start > at {
             parts.push(zeros(block.queries.start - at)?);
         }
-        parts.push(attend(q, [k, v], [sk, sv], layout, block)?);
+        parts.push(composed_block(q, [k, v], [sk, sv], layout, block)?);
         at = block.queries.end;
     }
     if at < q.dim(0)? || parts.is_empty() {
@@ -30,7 +32,7 @@ pub(in crate::kernels) fn composed(
 }
 
 /// One block: scores against shared keys and own keys side by side, one softmax.
-fn attend(
+fn composed_block(
     q: &Tensor,
     own: [&Tensor; 2],
     shared: [&Tensor; 2],

@@ -1,14 +1,7 @@
-//! Attention over blocks of rows, without masks: a layout says what each row sees.
+//! What each row of an attention sees.
 
 use crate::error::{Error, Result};
-use crate::kernels::attention::bf16::call::attend;
-use crate::kernels::attention::bf16::kernel::Attend;
-use crate::kernels::attention::composed::composed;
-use crate::kernels::attention::f32::op::Attention;
-use crate::kernels::attention::shared_keys::SharedKeys;
-use crate::kernels::exec::{dims2, expect_dims, on_cpu};
 use crate::kernels::gemm::packed::WeightFormat;
-use candle_core::Tensor;
 use std::ops::Range;
 
 /// Query rows that all see the same shared keys, each beside keys of its own item.
@@ -36,12 +29,12 @@ pub struct Block {
 
 impl Block {
     /// Items of the block.
-    pub(in crate::kernels) fn items(&self) -> usize {
+    pub(super) fn items(&self) -> usize {
         self.queries.len() / self.q_period
     }
 
     /// Own keys that row `i` of an item sees.
-    pub(in crate::kernels) fn seen(&self, i: usize) -> usize {
+    pub(super) fn seen(&self, i: usize) -> usize {
         if self.causal { self.k_period - self.q_period + i + 1 } else { self.k_period }
     }
 }
@@ -72,62 +65,6 @@ pub enum Precision {
     Bf16,
 }
 
-/// `softmax(q k^T / sqrt(head_dim)) v` where each row sees what `layout` says.
-///
-/// `q` is `[nq, heads * head_dim]`, `k` and `v` `[nk, kv_heads * head_dim]`; gives `[nq, heads *
-/// head_dim]`. With `shared` (like `k` and `v`, of any number of rows) the blocks' shared
-/// keys are its rows, otherwise rows of `k` and `v`. One softmax runs over shared and own keys
-/// together, so many short suffixes against one prefix cost one matrix product with the prefix, as
-/// in Hydragen (arXiv 2402.05099), and the result is exact. Differentiable in every tensor; the
-/// backward pass computes the probabilities again from the rows' log-sum-exp.
-///
-/// Rows out of range, overlapping query rows, a row that would see no key, and shapes that do not
-/// fit are [`Error::Argument`].
-pub fn attention(
-    q: &Tensor,
-    k: &Tensor,
-    v: &Tensor,
-    shared: Option<&SharedKeys>,
-    layout: &AttentionLayout,
-) -> Result<Tensor> {
-    let (nq, _) = dims2("q", q)?;
-    let (nk, _) = dims2("k", k)?;
-    let width = layout.kv_heads * layout.head_dim;
-    expect_dims("q", q, &[nq, layout.heads * layout.head_dim])?;
-    expect_dims("k", k, &[nk, width])?;
-    expect_dims("v", v, &[nk, width])?;
-    let mut shared_rows = nk;
-    let pair = shared.map(|shared| (shared.keys(), shared.values()));
-    if let Some((sk, sv)) = pair {
-        shared_rows = dims2("shared keys", sk)?.0;
-        expect_dims("shared keys", sk, &[shared_rows, width])?;
-        expect_dims("shared values", sv, &[shared_rows, width])?;
-    }
-    check(layout, nq, nk, shared_rows)?;
-    if let Some((sk, sv)) = pair
-        && (sk.track_op() || sv.track_op())
-    {
-        // Someone wants the extra pair's gradient: make it part of k and v.
-        let (k, v) = (Tensor::cat(&[sk, k], 0)?, Tensor::cat(&[sv, v], 0)?);
-        return attention(q, &k, &v, None, &layout.moved(shared_rows));
-    }
-    if !on_cpu(&[q, k, v]) || pair.is_some_and(|(sk, sv)| !on_cpu(&[sk, sv])) {
-        return composed(q, k, v, pair, layout);
-    }
-    if layout.precision == Precision::Bf16
-        && let Some(kernel) = Attend::current()
-        && ![q, k, v].iter().any(|t| t.track_op())
-    {
-        return attend(kernel, [q, k, v], shared, layout);
-    }
-    let shared = match pair {
-        Some((sk, sv)) => Some((sk.contiguous()?, sv.contiguous()?)),
-        None => None,
-    };
-    let op = Attention::new(layout.clone(), shared);
-    Ok(q.contiguous()?.apply_op3(&k.contiguous()?, &v.contiguous()?, op)?)
-}
-
 impl From<WeightFormat> for Precision {
     /// What goes with weights of a format.
     fn from(format: WeightFormat) -> Self {
@@ -140,50 +77,51 @@ impl From<WeightFormat> for Precision {
 
 impl AttentionLayout {
     /// The layout after `rows` rows were put before the own keys.
-    fn moved(&self, rows: usize) -> AttentionLayout {
+    pub(super) fn moved(&self, rows: usize) -> AttentionLayout {
         let mut layout = self.clone();
         for block in &mut layout.blocks {
             block.own_start += rows;
         }
         layout
     }
-}
 
-fn check(layout: &AttentionLayout, nq: usize, nk: usize, shared_rows: usize) -> Result<()> {
-    let wrong = |found: String, expected: &str| Err(Error::argument("layout", found, expected));
-    let AttentionLayout { heads, kv_heads, head_dim, blocks, .. } = layout;
-    if *kv_heads == 0 || *head_dim == 0 || *heads == 0 || heads % kv_heads != 0 {
-        let found = format!("{heads} heads of {head_dim}, {kv_heads} key heads");
-        return wrong(found, "heads a multiple of key heads, all at least 1");
+    /// Checks that the layout fits so many rows of queries, own keys and shared keys.
+    pub(super) fn check(&self, nq: usize, nk: usize, shared_rows: usize) -> Result<()> {
+        let wrong = |found: String, expected: &str| Err(Error::argument("layout", found, expected));
+        let AttentionLayout { heads, kv_heads, head_dim, blocks, .. } = self;
+        if *kv_heads == 0 || *head_dim == 0 || *heads == 0 || heads % kv_heads != 0 {
+            let found = format!("{heads} heads of {head_dim}, {kv_heads} key heads");
+            return wrong(found, "heads a multiple of key heads, all at least 1");
+        }
+        for block in blocks {
+            let found = || format!("{block:?}");
+            let rows = block.queries.end.saturating_sub(block.queries.start);
+            if block.q_period == 0 || rows % block.q_period != 0 {
+                return wrong(found(), "query rows a multiple of q_period, which is at least 1");
+            }
+            if block.causal && block.k_period < block.q_period {
+                return wrong(found(), "k_period of at least q_period in a causal block");
+            }
+            if block.k_period == 0 && block.shared.is_empty() && rows > 0 {
+                return wrong(found(), "at least one key for every row");
+            }
+            let own_end = (rows / block.q_period)
+                .checked_mul(block.k_period)
+                .and_then(|own| own.checked_add(block.own_start));
+            if block.queries.end > nq
+                || (!block.shared.is_empty() && block.shared.end > shared_rows)
+                || own_end.is_none_or(|end| end > nk)
+            {
+                let expected = format!("rows within {nq} queries, {nk} keys and {shared_rows} shared keys");
+                return wrong(found(), &expected);
+            }
+        }
+        let mut ranges: Vec<_> =
+            blocks.iter().filter(|b| !b.queries.is_empty()).map(|b| b.queries.clone()).collect();
+        ranges.sort_by_key(|r| r.start);
+        if let Some(pair) = ranges.windows(2).find(|p| p[1].start < p[0].end) {
+            return wrong(format!("query rows {:?} and {:?}", pair[0], pair[1]), "no overlap");
+        }
+        Ok(())
     }
-    for block in blocks {
-        let found = || format!("{block:?}");
-        let rows = block.queries.end.saturating_sub(block.queries.start);
-        if block.q_period == 0 || rows % block.q_period != 0 {
-            return wrong(found(), "query rows a multiple of q_period, which is at least 1");
-        }
-        if block.causal && block.k_period < block.q_period {
-            return wrong(found(), "k_period of at least q_period in a causal block");
-        }
-        if block.k_period == 0 && block.shared.is_empty() && rows > 0 {
-            return wrong(found(), "at least one key for every row");
-        }
-        let own_end = (rows / block.q_period)
-            .checked_mul(block.k_period)
-            .and_then(|own| own.checked_add(block.own_start));
-        if block.queries.end > nq
-            || (!block.shared.is_empty() && block.shared.end > shared_rows)
-            || own_end.is_none_or(|end| end > nk)
-        {
-            let expected = format!("rows within {nq} queries, {nk} keys and {shared_rows} shared keys");
-            return wrong(found(), &expected);
-        }
-    }
-    let mut ranges: Vec<_> =
-        blocks.iter().filter(|b| !b.queries.is_empty()).map(|b| b.queries.clone()).collect();
-    ranges.sort_by_key(|r| r.start);
-    if let Some(pair) = ranges.windows(2).find(|p| p[1].start < p[0].end) {
-        return wrong(format!("query rows {:?} and {:?}", pair[0], pair[1]), "no overlap");
-    }
-    Ok(())
 }

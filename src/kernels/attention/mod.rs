@@ -1,15 +1,20 @@
-//! Attention over blocks of rows: what each row sees, how the work is cut, and its forms in f32, in bf16 and composed
-//! from candle operations.
+//! Attention over blocks of rows, without masks.
+//!
+//! A `layout` says which row sees which keys, a `plan` cuts the work into tiles of rows and sets of keys, and `dispatch` chooses the form:
+//! `f32` (with gradients), `bf16` (without), or `composed` from candle operations for other devices and types.
 
-pub(in crate::kernels) mod bf16;
-pub(in crate::kernels) mod composed;
-pub(in crate::kernels) mod f32;
-pub(in crate::kernels) mod layout;
-pub(in crate::kernels) mod plan;
-pub(in crate::kernels) mod rows;
-pub(in crate::kernels) mod shared_keys;
+mod bf16;
+mod composed;
+mod dispatch;
+mod f32;
+mod inputs;
+mod layout;
+mod own_keys;
+mod plan;
+mod shared_keys;
 #[cfg(test)]
 mod tests;
 
-pub use layout::{AttentionLayout, Block, Precision, attention};
+pub use dispatch::attention;
+pub use layout::{AttentionLayout, Block, Precision};
 pub use shared_keys::SharedKeys;

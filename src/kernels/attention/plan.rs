@@ -1,34 +1,34 @@
 //! How attention's work is cut: tiles of query rows, sets of keys, spans that share no key.
 
-use crate::kernels::attention::layout::{AttentionLayout, Block};
+use super::layout::{AttentionLayout, Block};
 use std::collections::HashMap;
 use std::ops::Range;
 
 /// Items with at most this many own keys are worked on row by row beside the shared product.
-pub(in crate::kernels) const SHORT: usize = 16;
-/// Scores of a tile, at most about so many: they should stay in the second-level cache.
+pub(super) const MAX_ROW_WISE_KEYS: usize = 16;
+/// Scores of a tile, about: they should stay in the second-level cache.
 const TILE_SCORES: usize = 96 * 1024;
 
 /// Keys that whole tiles see, so that they are packed once.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
-pub(in crate::kernels) struct KeySet {
+pub(super) struct KeySet {
     /// Rows of the extra pair rather than of k and v.
-    pub(in crate::kernels) extra: bool,
-    pub(in crate::kernels) rows: Range<usize>,
+    pub(super) extra: bool,
+    pub(super) rows: Range<usize>,
 }
 
 /// Consecutive query rows of one block, worked on together.
 #[derive(Clone, Debug)]
-pub(in crate::kernels) struct Tile {
-    pub(in crate::kernels) rows: Range<usize>,
+pub(super) struct QueryTile {
+    pub(super) rows: Range<usize>,
     /// Index of the shared key set, if the block has shared keys.
-    pub(in crate::kernels) shared: Option<usize>,
-    pub(in crate::kernels) own: Own,
+    pub(super) shared: Option<usize>,
+    pub(super) own: OwnKeys,
 }
 
 /// The own keys of a tile.
 #[derive(Clone, Debug)]
-pub(in crate::kernels) enum Own {
+pub(super) enum OwnKeys {
     /// All rows are of one item: the key set's index, the keys that the tile's last row sees.
     Set { set: usize, seen: usize },
     /// Few keys each, of several items.
@@ -36,16 +36,16 @@ pub(in crate::kernels) enum Own {
 }
 
 /// The plan of one call. Depends on the layout only.
-pub(in crate::kernels) struct Plan {
-    pub(in crate::kernels) sets: Vec<KeySet>,
+pub(super) struct Plan {
+    pub(super) sets: Vec<KeySet>,
     /// In order of their rows, which do not overlap.
-    pub(in crate::kernels) tiles: Vec<Tile>,
+    pub(super) tiles: Vec<QueryTile>,
     /// The block of each tile.
-    pub(in crate::kernels) blocks: Vec<Block>,
+    pub(super) blocks: Vec<Block>,
 }
 
 impl Plan {
-    pub(in crate::kernels) fn new(layout: &AttentionLayout, extra: bool) -> Plan {
+    pub(super) fn new(layout: &AttentionLayout, extra: bool) -> Plan {
         let mut blocks: Vec<Block> =
             layout.blocks.iter().filter(|b| !b.queries.is_empty()).cloned().collect();
         blocks.sort_by_key(|b| b.queries.start);
@@ -67,14 +67,14 @@ impl Plan {
         let shared = (!block.shared.is_empty()).then(|| number(KeySet { extra, rows: block.shared.clone() }));
         let height = tile_rows(block.shared.len() + block.k_period, group);
         let start = block.queries.start;
-        let mut push = |rows: Range<usize>, own: Own| {
-            self.tiles.push(Tile { rows, shared, own });
+        let mut push = |rows: Range<usize>, own: OwnKeys| {
+            self.tiles.push(QueryTile { rows, shared, own });
             self.blocks.push(block.clone());
         };
-        if block.k_period <= SHORT {
+        if block.k_period <= MAX_ROW_WISE_KEYS {
             for first in (0..block.queries.len()).step_by(height) {
                 let last = (first + height).min(block.queries.len());
-                push(start + first..start + last, Own::Rows);
+                push(start + first..start + last, OwnKeys::Rows);
             }
             return;
         }
@@ -84,18 +84,18 @@ impl Plan {
             let start = start + item * block.q_period;
             for first in (0..block.q_period).step_by(height) {
                 let last = (first + height).min(block.q_period);
-                push(start + first..start + last, Own::Set { set, seen: block.seen(last - 1) });
+                push(start + first..start + last, OwnKeys::Set { set, seen: block.seen(last - 1) });
             }
         }
     }
 
     /// Whether each of `rows` query rows is in a tile.
-    pub(in crate::kernels) fn covers(&self, rows: usize) -> bool {
+    pub(super) fn covers(&self, rows: usize) -> bool {
         self.tiles.iter().map(|tile| tile.rows.len()).sum::<usize>() == rows
     }
 
     /// Splits a buffer of query rows of `width` into the tiles' rows.
-    pub(in crate::kernels) fn split<'b>(&self, mut data: &'b mut [f32], width: usize) -> Vec<&'b mut [f32]> {
+    pub(super) fn split<'b, T>(&self, mut data: &'b mut [T], width: usize) -> Vec<&'b mut [T]> {
         let (mut parts, mut at) = (Vec::with_capacity(self.tiles.len()), 0);
         for tile in &self.tiles {
             let (_, rest) = data.split_at_mut((tile.rows.start - at) * width);
@@ -106,7 +106,26 @@ impl Plan {
         parts
     }
 
-    /// Own key rows of the first and after the last item that the tile touches.
+    /// Notes which own keys some rows of a tile see, a query row counting once for each head of a group: how many each sees, and
+    /// which key row is its first.
+    pub(super) fn visible_own_keys(
+        &self,
+        tile: usize,
+        group: usize,
+        rows: Range<usize>,
+        (seen, first): (&mut Vec<usize>, &mut Vec<usize>),
+    ) {
+        let (start, block) = (self.tiles[tile].rows.start, &self.blocks[tile]);
+        seen.clear();
+        first.clear();
+        for r in rows {
+            let row = start + r / group - block.queries.start;
+            seen.push(block.seen(row % block.q_period));
+            first.push(block.own_start + row / block.q_period * block.k_period);
+        }
+    }
+
+    /// Own key rows of all items that the tile touches.
     fn own_rows(&self, tile: usize) -> Range<usize> {
         let (rows, block) = (&self.tiles[tile].rows, &self.blocks[tile]);
         let item = |row: usize| (row - block.queries.start) / block.q_period;
@@ -116,7 +135,7 @@ impl Plan {
 
     /// Disjoint spans of key rows of k and v, in order, each with the tiles that read only there:
     /// the gradients of different spans can be summed independently.
-    pub(in crate::kernels) fn spans(&self) -> Vec<(Range<usize>, Vec<usize>)> {
+    pub(super) fn spans(&self) -> Vec<(Range<usize>, Vec<usize>)> {
         let mut spans: Vec<(Range<usize>, Vec<usize>)> = Vec::new();
         for (t, tile) in self.tiles.iter().enumerate() {
             let mut span = self.own_rows(t);

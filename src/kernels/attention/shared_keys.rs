@@ -1,6 +1,6 @@
 //! Keys and values that many calls see.
 
-use crate::kernels::attention::bf16::kernel::PackedKeys;
+use super::bf16::PackedKeys;
 use candle_core::Tensor;
 use std::sync::{Arc, OnceLock};
 
@@ -32,7 +32,7 @@ impl SharedKeys {
     }
 
     /// All rows packed for so many heads, by `pack` if they are not yet.
-    pub(in crate::kernels) fn packed(
+    pub(super) fn packed(
         &self,
         kv_heads: usize,
         pack: impl FnOnce() -> Vec<PackedKeys>,
@@ -40,7 +40,7 @@ impl SharedKeys {
         match self.packed.get() {
             Some(packed) if packed.len() == kv_heads => packed.clone(),
             _ => {
-                // Not by `get_or_init`: who waits for another thread in it may be what that thread has to do first.
+                // Not by `get_or_init`: a thread of the pool that waits in it may be the one whose work the packing thread waits for.
                 let packed: Arc<[PackedKeys]> = pack().into();
                 let _ = self.packed.set(packed.clone());
                 packed

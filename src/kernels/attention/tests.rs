@@ -1,10 +1,8 @@
 //! Attention against its composed form, and its gradients.
 
-use crate::kernels::attention::bf16::call::attend;
-use crate::kernels::attention::bf16::kernel::Attend;
-use crate::kernels::attention::composed::composed;
-use crate::kernels::attention::layout::{AttentionLayout, Block, Precision, attention};
-use crate::kernels::attention::shared_keys::SharedKeys;
+use super::bf16::{AttentionKernel, bf16_attention};
+use super::composed::composed;
+use super::{AttentionLayout, Block, Precision, SharedKeys, attention};
 use crate::kernels::testing::{
     at_every_level, check_gradients, close, gradients, random, same_on_any_thread_count, values,
 };
@@ -209,8 +207,8 @@ fn in_bf16_it_is_the_same_to_three_digits() {
     for (nq, nk, l) in bf16_cases() {
         let t = qkv(nq, nk, &l);
         let exact = plainly(&t, None, &l);
-        for kernel in Attend::every() {
-            let found = values(&attend(kernel, [&t[0], &t[1], &t[2]], None, &l).unwrap());
+        for kernel in AttentionKernel::every() {
+            let found = values(&bf16_attention(&kernel, [&t[0], &t[1], &t[2]], None, &l).unwrap());
             assert_eq!(found.len(), exact.len());
             for (i, (f, e)) in found.iter().zip(&exact).enumerate() {
                 // Values below 1, of which each and its weight are rounded to 8 bits, and so are the scores' operands.
@@ -233,9 +231,9 @@ fn in_bf16_the_extra_pair_is_seen() {
     let mut other = l.clone();
     (other.heads, other.kv_heads, other.head_dim) = (8, 4, 4);
     let exact_other = plainly(&t, Some((shared.keys(), shared.values())), &other);
-    for kernel in Attend::every() {
+    for kernel in AttentionKernel::every() {
         for (l, exact) in [(&l, &exact), (&other, &exact_other), (&l, &exact)] {
-            let found = attend(kernel, [&t[0], &t[1], &t[2]], Some(&shared), l).unwrap();
+            let found = bf16_attention(&kernel, [&t[0], &t[1], &t[2]], Some(&shared), l).unwrap();
             for (f, e) in values(&found).iter().zip(exact) {
                 assert!((f64::from(*f) - e).abs() <= 8e-3, "{f}, expected {e}");
             }
@@ -254,8 +252,8 @@ fn in_bf16_a_row_depends_on_itself_only() {
     // All rows at once, and each batch of some alone: the same bits. So it is on any number of threads.
     let whole = layout(4, 2, 48, vec![block(0..200, 0..70, 70, 1, 1, true)]);
     let [q, k, v] = qkv(200, 270, &whole);
-    for kernel in Attend::every() {
-        let run = |t: [&Tensor; 3], l: &AttentionLayout| attend(kernel, t, None, l).unwrap();
+    for kernel in AttentionKernel::every() {
+        let run = |t: [&Tensor; 3], l: &AttentionLayout| bf16_attention(&kernel, t, None, l).unwrap();
         let all = run([&q, &k, &v], &whole);
         for (from, n) in [(0, 1), (7, 5), (90, 110)] {
             let mut part = whole.clone();
@@ -280,9 +278,9 @@ fn in_bf16_not_a_number_is_seen_where_it_counts() {
         t[which] = bad;
         t
     };
-    for kernel in Attend::every() {
+    for kernel in AttentionKernel::every() {
         let nan = |t: [Tensor; 3], l: &AttentionLayout| -> Vec<bool> {
-            let out = values(&attend(kernel, [&t[0], &t[1], &t[2]], None, l).unwrap());
+            let out = values(&bf16_attention(&kernel, [&t[0], &t[1], &t[2]], None, l).unwrap());
             out.chunks(20).map(|head| head.iter().any(|x| x.is_nan())).collect()
         };
         assert!(nan(t.clone(), &l).iter().all(|nan| !nan));
@@ -302,7 +300,7 @@ fn only_inference_is_rounded() {
     let exact_grads = gradients(&t, |t| attention(&t[0], &t[1], &t[2], None, &l));
     l.precision = Precision::Bf16;
     let rounded = attention(&t[0], &t[1], &t[2], None, &l).unwrap();
-    assert_eq!(values(&rounded) == values(&exact), Attend::current().is_none());
+    assert_eq!(values(&rounded) == values(&exact), AttentionKernel::current().is_none());
     let grads = gradients(&t, |t| attention(&t[0], &t[1], &t[2], None, &l));
     for (g, e) in grads.iter().zip(&exact_grads) {
         close(g, e, 0.0);

@@ -1,91 +1,88 @@
-//! Which instruction set the kernels use, found once at run time.
+//! The level that the kernels work at, chosen once at run time.
 
+#[cfg(target_arch = "aarch64")]
+use super::aarch64::{Neon, NeonBf16};
+#[cfg(target_arch = "x86_64")]
+use super::amx::{self, Amx};
+#[cfg(target_arch = "x86_64")]
+use super::x86_64::{Avx2, Avx512, Avx512Bf16};
 use std::sync::OnceLock;
 
-/// An instruction set that this machine is known to have: values come only from this module's
-/// checks, so that holding one is the proof that the matching kernel may be called.
+/// An instruction set that all kernels are written for, with the proof that this machine has it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(in crate::kernels) struct Level(Isa);
-
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Isa {
+pub(in crate::kernels) enum Level {
     Portable,
     #[cfg(target_arch = "x86_64")]
-    Avx2,
+    Avx2(Avx2),
     #[cfg(target_arch = "x86_64")]
-    Avx512,
-    /// AVX-512, and AMX for packed weights.
+    Avx512(Avx512),
+    /// AMX for packed weights and attention in bf16, AVX-512 for everything else.
     #[cfg(target_arch = "x86_64")]
-    Amx,
+    Amx(Amx),
     #[cfg(target_arch = "aarch64")]
-    Neon,
+    Neon(Neon),
 }
 
 impl Level {
-    /// Every level that this machine has, slowest first.
-    pub(in crate::kernels) fn available() -> Vec<Level> {
-        #[allow(unused_mut)]
-        let mut levels = vec![Level(Isa::Portable)];
+    /// The levels that are chosen from where none is asked for, slowest first.
+    fn detected() -> Vec<Level> {
+        let levels = [
+            Some(Level::Portable),
+            #[cfg(target_arch = "x86_64")]
+            Avx2::detect().map(Level::Avx2),
+            #[cfg(target_arch = "x86_64")]
+            Avx512::detect().map(Level::Avx512),
+            // The kernels read packed words as little-endian.
+            #[cfg(target_arch = "aarch64")]
+            Neon::detect().filter(|_| cfg!(target_endian = "little")).map(Level::Neon),
+        ];
+        levels.into_iter().flatten().collect()
+    }
+
+    /// A level that is used only where it is asked for: AMX, which has never run on hardware that has it.
+    fn on_request(name: &str) -> Option<Level> {
         #[cfg(target_arch = "x86_64")]
-        {
-            let avx2 = is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma");
-            if avx2 {
-                levels.push(Level(Isa::Avx2));
-            }
-            if avx2
-                && is_x86_feature_detected!("avx512f")
-                && is_x86_feature_detected!("avx512vl")
-                && is_x86_feature_detected!("avx512dq")
-                && is_x86_feature_detected!("avx512bw")
-            {
-                levels.push(Level(Isa::Avx512));
-                if crate::kernels::gemm::packed::amx_usable() {
-                    levels.push(Level(Isa::Amx));
-                }
-            }
+        if name == "amx" {
+            return amx::usable().map(Level::Amx);
         }
-        // The packed words are read as little-endian.
-        #[cfg(target_arch = "aarch64")]
-        if cfg!(target_endian = "little") && std::arch::is_aarch64_feature_detected!("neon") {
-            levels.push(Level(Isa::Neon));
-        }
-        levels
+        let _ = name;
+        None
+    }
+
+    /// Every level that this machine has, slowest first.
+    #[cfg(test)]
+    pub(in crate::kernels) fn available() -> Vec<Level> {
+        Level::detected().into_iter().chain(Level::on_request("amx")).collect()
     }
 
     /// The level's name, as `SDIM_KERNEL` spells it.
     pub(in crate::kernels) fn name(self) -> &'static str {
-        match self.0 {
-            Isa::Portable => "portable",
+        match self {
+            Level::Portable => "portable",
             #[cfg(target_arch = "x86_64")]
-            Isa::Avx2 => "avx2",
+            Level::Avx2(_) => "avx2",
             #[cfg(target_arch = "x86_64")]
-            Isa::Avx512 => "avx512",
+            Level::Avx512(_) => "avx512",
             #[cfg(target_arch = "x86_64")]
-            Isa::Amx => "amx",
+            Level::Amx(_) => "amx",
             #[cfg(target_arch = "aarch64")]
-            Isa::Neon => "neon",
+            Level::Neon(_) => "neon",
         }
     }
 
-    /// AVX-512 at least.
-    #[cfg(target_arch = "x86_64")]
-    pub(in crate::kernels) fn is_avx512(self) -> bool {
-        matches!(self.0, Isa::Avx512 | Isa::Amx)
-    }
-
-    #[cfg(target_arch = "x86_64")]
-    pub(in crate::kernels) fn is_amx(self) -> bool {
-        self.0 == Isa::Amx
-    }
-
-    #[cfg(target_arch = "x86_64")]
-    pub(in crate::kernels) fn is_avx2(self) -> bool {
-        self.0 == Isa::Avx2
-    }
-
-    #[cfg(target_arch = "aarch64")]
-    pub(in crate::kernels) fn is_neon(self) -> bool {
-        self.0 == Isa::Neon
+    /// Whether this machine has instructions that multiply pairs of bf16 at this level.
+    pub(in crate::kernels) fn multiplies_bf16(self) -> bool {
+        match self {
+            Level::Portable => false,
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx2(_) => false,
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx512(_) => Avx512Bf16::detect().is_some(),
+            #[cfg(target_arch = "x86_64")]
+            Level::Amx(_) => true,
+            #[cfg(target_arch = "aarch64")]
+            Level::Neon(_) => NeonBf16::detect().is_some(),
+        }
     }
 
     /// The level in use. A `SDIM_KERNEL` that the machine lacks, or that is no level's name, is
@@ -101,11 +98,11 @@ impl Level {
 }
 
 fn choose(asked: Option<&str>) -> Level {
-    let available = Level::available();
-    let fastest = available.last().copied().unwrap_or(Level(Isa::Portable));
+    let detected = Level::detected();
+    let fastest = detected.last().copied().unwrap_or(Level::Portable);
     let Some(asked) = asked else { return fastest };
-    match available.iter().find(|level| level.name() == asked) {
-        Some(level) => *level,
+    match detected.into_iter().chain(Level::on_request(asked)).find(|level| level.name() == asked) {
+        Some(level) => level,
         None => {
             tracing::warn!("SDIM_KERNEL={asked} is not available here; using {}", fastest.name());
             fastest
@@ -113,41 +110,26 @@ fn choose(asked: Option<&str>) -> Level {
     }
 }
 
-/// Defines `fn $name(level, args..)` that runs `$body::<LANES>(args..)` compiled for that level, with
-/// `LANES` f32 to a register: 4, 8 or 16, or 1 where that is left to the compiler. The body must be `#[inline(always)]` and contain no closure that another thread runs.
+/// Defines `fn $name(level, arguments...)` that runs `$body(isa, arguments...)` compiled for that level, `isa` being its token. For
+/// the body holds what [`call_compiled!`](super::call_compiled) says.
 macro_rules! per_level {
-    ($(#[$meta:meta])* fn $name:ident $(<$(const $c:ident : usize),+>)? ($($arg:ident : $ty:ty),* $(,)?) $(-> $out:ty)? = $body:ident) => {
+    ($(#[$meta:meta])* fn $name:ident($($arg:ident: $ty:ty),* $(,)?) $(-> $out:ty)? = $body:ident) => {
         $(#[$meta])*
         #[allow(clippy::too_many_arguments)]
-        pub(in crate::kernels) fn $name $(<$(const $c: usize),+>)? (level: $crate::kernels::isa::level::Level, $($arg: $ty),*) $(-> $out)? {
-            #[cfg(target_arch = "x86_64")]
-            {
-                #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw,avx2,fma")]
-                #[allow(clippy::too_many_arguments)]
-                fn avx512 $(<$(const $c: usize),+>)? ($($arg: $ty),*) $(-> $out)? {
-                    $body::<16 $($(, $c)+)?>($($arg),*)
-                }
-                #[target_feature(enable = "avx2,fma")]
-                #[allow(clippy::too_many_arguments)]
-                fn avx2 $(<$(const $c: usize),+>)? ($($arg: $ty),*) $(-> $out)? {
-                    $body::<8 $($(, $c)+)?>($($arg),*)
-                }
-                if level.is_avx512() {
-                    // SAFETY: a `Level` says AVX-512 only where the CPU reported these features.
-                    return unsafe { avx512 $(::<$($c),+>)? ($($arg),*) };
-                }
-                if level.is_avx2() {
-                    // SAFETY: a `Level` says AVX2 only where the CPU reported AVX2 and FMA.
-                    return unsafe { avx2 $(::<$($c),+>)? ($($arg),*) };
-                }
+        pub(in crate::kernels) fn $name(level: $crate::kernels::isa::Level, $($arg: $ty),*) $(-> $out)? {
+            #[allow(unused_imports)]
+            use $crate::kernels::isa::{Level, Portable, call_compiled};
+            match level {
+                Level::Portable => $body(Portable, $($arg),*),
+                #[cfg(target_arch = "x86_64")]
+                Level::Avx2(isa) => call_compiled!(Avx2, isa, $body, ($($arg: $ty),*) $(-> $out)?),
+                #[cfg(target_arch = "x86_64")]
+                Level::Avx512(isa) => call_compiled!(Avx512, isa, $body, ($($arg: $ty),*) $(-> $out)?),
+                #[cfg(target_arch = "x86_64")]
+                Level::Amx(isa) => call_compiled!(Avx512, isa.into(), $body, ($($arg: $ty),*) $(-> $out)?),
+                #[cfg(target_arch = "aarch64")]
+                Level::Neon(isa) => call_compiled!(Neon, isa, $body, ($($arg: $ty),*) $(-> $out)?),
             }
-            // NEON is part of what this architecture's code is compiled for.
-            #[cfg(target_arch = "aarch64")]
-            if level.is_neon() {
-                return $body::<4 $($(, $c)+)?>($($arg),*);
-            }
-            let _ = level;
-            $body::<1 $($(, $c)+)?>($($arg),*)
         }
     };
 }
@@ -160,7 +142,7 @@ pub(in crate::kernels) mod forced {
 
     thread_local!(static FORCED: Cell<Option<Level>> = const { Cell::new(None) });
 
-    pub(in crate::kernels) fn get() -> Option<Level> {
+    pub(super) fn get() -> Option<Level> {
         FORCED.get()
     }
 
@@ -195,6 +177,14 @@ mod tests {
     #[test]
     fn an_unknown_level_gives_the_fastest() {
         assert_eq!(choose(Some("quantum")), choose(None));
-        assert_eq!(Some(&choose(None)), Level::available().last());
+        assert_eq!(Some(&choose(None)), Level::detected().last());
+    }
+
+    #[test]
+    fn amx_is_used_only_where_it_is_asked_for() {
+        assert!(Level::detected().iter().all(|level| level.name() != "amx"));
+        assert_ne!(choose(None).name(), "amx");
+        let asked = choose(Some("amx"));
+        assert!(asked.name() == "amx" || asked == choose(None));
     }
 }

@@ -1,13 +1,16 @@
 //! SwiGLU and GELU.
 
 use crate::error::Result;
-use crate::kernels::exec::{on_cpu, output, read2, read3, same_shape, slice, tensor, written};
-use crate::kernels::isa::level::{Level, per_level};
-use crate::kernels::simd::math::{erf, madd, sigmoid};
+use crate::kernels::exec::{on_cpu, output, read2, read3, same_shape, slice, tensor};
+use crate::kernels::isa::{Isa, Level, per_level};
+use crate::kernels::simd::{erf, madd, sigmoid};
+use crate::kernels::written::written;
 use candle_core::{CpuStorage, CustomOp1, CustomOp2, Layout, Shape, Tensor};
 use rayon::prelude::*;
+use std::mem::MaybeUninit;
 
-const CHUNK: usize = 16 * 1024;
+/// Elements of a task, about.
+const CHUNK_ELEMENTS: usize = 16 * 1024;
 
 /// `silu(gate) * up`, element by element, where `silu(z) = z / (1 + e^-z)`.
 ///
@@ -34,15 +37,16 @@ pub fn gelu_erf(x: &Tensor) -> Result<Tensor> {
 struct SwiGlu;
 
 #[inline(always)]
-fn swiglu_body<const LANES: usize>(out: &mut [f32], gate: &[f32], up: &[f32]) {
+fn swiglu_body<S: Isa>(isa: S, out: &mut [MaybeUninit<f32>], gate: &[f32], up: &[f32]) {
     for ((o, &g), &u) in out.iter_mut().zip(gate).zip(up) {
-        *o = g * sigmoid::<LANES>(g) * u;
+        o.write(g * sigmoid(isa, g) * u);
     }
 }
-per_level!(fn swiglu_chunk(out: &mut [f32], gate: &[f32], up: &[f32]) = swiglu_body);
+per_level!(fn swiglu_chunk(out: &mut [MaybeUninit<f32>], gate: &[f32], up: &[f32]) = swiglu_body);
 
 #[inline(always)]
-fn swiglu_grad_body<const LANES: usize>(
+fn swiglu_grad_body<S: Isa>(
+    isa: S,
     d_gate: &mut [f32],
     d_up: &mut [f32],
     gate: &[f32],
@@ -51,10 +55,10 @@ fn swiglu_grad_body<const LANES: usize>(
 ) {
     let inputs = gate.iter().zip(up).zip(grad);
     for ((dg, du), ((&g, &u), &d)) in d_gate.iter_mut().zip(d_up).zip(inputs) {
-        let s = sigmoid::<LANES>(g);
+        let s = sigmoid(isa, g);
         let silu = g * s;
         *du = d * silu;
-        *dg = d * u * madd::<LANES>(silu, 1.0 - s, s);
+        *dg = d * u * madd(isa, silu, 1.0 - s, s);
     }
 }
 per_level!(fn swiglu_grad_chunk(d_gate: &mut [f32], d_up: &mut [f32], gate: &[f32], up: &[f32], grad: &[f32]) = swiglu_grad_body);
@@ -73,9 +77,11 @@ impl CustomOp2 for SwiGlu {
     ) -> candle_core::Result<(CpuStorage, Shape)> {
         let (gate, up) = (slice(s1, l1)?, slice(s2, l2)?);
         let level = Level::current();
-        let inputs = gate.par_chunks(CHUNK).zip(up.par_chunks(CHUNK));
-        let products = |out: &mut [f32]| {
-            out.par_chunks_mut(CHUNK).zip(inputs).for_each(|(o, (g, u))| swiglu_chunk(level, o, g, u));
+        let inputs = gate.par_chunks(CHUNK_ELEMENTS).zip(up.par_chunks(CHUNK_ELEMENTS));
+        let products = |out: &mut [MaybeUninit<f32>]| {
+            out.par_chunks_mut(CHUNK_ELEMENTS)
+                .zip(inputs)
+                .for_each(|(o, (g, u))| swiglu_chunk(level, o, g, u));
         };
         // SAFETY: both inputs have the same length, so that each element gets its product.
         let out = unsafe { written(gate.len(), products) };
@@ -94,9 +100,12 @@ impl CustomOp2 for SwiGlu {
         let (dg, du) = read3(gate, up, grad, |g, u, d| {
             let mut dg = vec![0f32; g.len()];
             let mut du = vec![0f32; g.len()];
-            let inputs = g.par_chunks(CHUNK).zip(u.par_chunks(CHUNK)).zip(d.par_chunks(CHUNK));
-            dg.par_chunks_mut(CHUNK)
-                .zip(du.par_chunks_mut(CHUNK))
+            let inputs = g
+                .par_chunks(CHUNK_ELEMENTS)
+                .zip(u.par_chunks(CHUNK_ELEMENTS))
+                .zip(d.par_chunks(CHUNK_ELEMENTS));
+            dg.par_chunks_mut(CHUNK_ELEMENTS)
+                .zip(du.par_chunks_mut(CHUNK_ELEMENTS))
                 .zip(inputs)
                 .for_each(|((dg, du), ((g, u), d))| swiglu_grad_chunk(level, dg, du, g, u, d));
             Ok((dg, du))
@@ -108,21 +117,21 @@ impl CustomOp2 for SwiGlu {
 struct Gelu;
 
 #[inline(always)]
-fn gelu_body<const LANES: usize>(out: &mut [f32], x: &[f32]) {
+fn gelu_body<S: Isa>(isa: S, out: &mut [MaybeUninit<f32>], x: &[f32]) {
     for (o, &x) in out.iter_mut().zip(x) {
-        let (e, _) = erf::<LANES>(x * std::f32::consts::FRAC_1_SQRT_2);
-        *o = 0.5 * x * (1.0 + e);
+        let (e, _) = erf(isa, x * std::f32::consts::FRAC_1_SQRT_2);
+        o.write(0.5 * x * (1.0 + e));
     }
 }
-per_level!(fn gelu_chunk(out: &mut [f32], x: &[f32]) = gelu_body);
+per_level!(fn gelu_chunk(out: &mut [MaybeUninit<f32>], x: &[f32]) = gelu_body);
 
 #[inline(always)]
-fn gelu_grad_body<const LANES: usize>(dx: &mut [f32], x: &[f32], grad: &[f32]) {
+fn gelu_grad_body<S: Isa>(isa: S, dx: &mut [f32], x: &[f32], grad: &[f32]) {
     // 1 / sqrt(2 pi): the height of the normal density.
-    const PEAK: f32 = 0.398_942_3;
+    const DENSITY_AT_ZERO: f32 = 0.398_942_3;
     for ((dx, &x), &d) in dx.iter_mut().zip(x).zip(grad) {
-        let (e, gauss) = erf::<LANES>(x * std::f32::consts::FRAC_1_SQRT_2);
-        *dx = d * madd::<LANES>(x * PEAK, gauss, 0.5 * (1.0 + e));
+        let (e, gauss) = erf(isa, x * std::f32::consts::FRAC_1_SQRT_2);
+        *dx = d * madd(isa, x * DENSITY_AT_ZERO, gauss, 0.5 * (1.0 + e));
     }
 }
 per_level!(fn gelu_grad_chunk(dx: &mut [f32], x: &[f32], grad: &[f32]) = gelu_grad_body);
@@ -135,8 +144,10 @@ impl CustomOp1 for Gelu {
     fn cpu_fwd(&self, s: &CpuStorage, l: &Layout) -> candle_core::Result<(CpuStorage, Shape)> {
         let x = slice(s, l)?;
         let level = Level::current();
-        let values = |out: &mut [f32]| {
-            out.par_chunks_mut(CHUNK).zip(x.par_chunks(CHUNK)).for_each(|(o, x)| gelu_chunk(level, o, x));
+        let values = |out: &mut [MaybeUninit<f32>]| {
+            out.par_chunks_mut(CHUNK_ELEMENTS)
+                .zip(x.par_chunks(CHUNK_ELEMENTS))
+                .for_each(|(o, x)| gelu_chunk(level, o, x));
         };
         // SAFETY: each element gets its value.
         let out = unsafe { written(x.len(), values) };
@@ -148,8 +159,8 @@ impl CustomOp1 for Gelu {
         let shape = x.shape().clone();
         let dx = read2(x, grad, |x, d| {
             let mut dx = vec![0f32; x.len()];
-            dx.par_chunks_mut(CHUNK)
-                .zip(x.par_chunks(CHUNK).zip(d.par_chunks(CHUNK)))
+            dx.par_chunks_mut(CHUNK_ELEMENTS)
+                .zip(x.par_chunks(CHUNK_ELEMENTS).zip(d.par_chunks(CHUNK_ELEMENTS)))
                 .for_each(|(dx, (x, d))| gelu_grad_chunk(level, dx, x, d));
             Ok(dx)
         })?;

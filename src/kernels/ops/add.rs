@@ -1,11 +1,14 @@
 //! The sum of two tensors: residual connections.
 
 use crate::error::Result;
-use crate::kernels::exec::{on_cpu, output, same_shape, slice, written};
+use crate::kernels::exec::{on_cpu, output, same_shape, slice};
+use crate::kernels::written::written;
 use candle_core::{CpuStorage, CustomOp2, Layout, Shape, Tensor};
 use rayon::prelude::*;
+use std::mem::MaybeUninit;
 
-const CHUNK: usize = 16 * 1024;
+/// Elements of a task, about.
+const CHUNK_ELEMENTS: usize = 16 * 1024;
 
 /// `a + b`, element by element.
 ///
@@ -36,11 +39,11 @@ impl CustomOp2 for Add {
         l2: &Layout,
     ) -> candle_core::Result<(CpuStorage, Shape)> {
         let (a, b) = (slice(s1, l1)?, slice(s2, l2)?);
-        let inputs = a.par_chunks(CHUNK).zip(b.par_chunks(CHUNK));
-        let sums = |out: &mut [f32]| {
-            out.par_chunks_mut(CHUNK).zip(inputs).for_each(|(out, (a, b))| {
+        let inputs = a.par_chunks(CHUNK_ELEMENTS).zip(b.par_chunks(CHUNK_ELEMENTS));
+        let sums = |out: &mut [MaybeUninit<f32>]| {
+            out.par_chunks_mut(CHUNK_ELEMENTS).zip(inputs).for_each(|(out, (a, b))| {
                 for ((o, a), b) in out.iter_mut().zip(a).zip(b) {
-                    *o = a + b;
+                    o.write(a + b);
                 }
             });
         };

@@ -1,10 +1,10 @@
 //! Statistics of a distribution over equally wide bins, from its logits.
 
-use crate::kernels::isa::level::{Level, per_level};
-use crate::kernels::simd::math::exp;
+use crate::kernels::isa::{Isa, Level, per_level};
+use crate::kernels::simd::exp;
 
-/// Elements summed together before the median is looked for among them.
-const BLOCK: usize = 64;
+/// Bins whose weights are summed first; the median is then looked for in the one block that holds it.
+const BLOCK_BINS: usize = 64;
 
 /// What [`bin_stats`] finds, in bins: bin `k` covers `k` to `k + 1`.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -21,7 +21,7 @@ pub struct BinStats {
 /// [`BinStats::near`] counts; `scratch` is overwritten. `None` if a logit is NaN or the largest is not finite.
 pub fn bin_stats(logits: &[f32], scratch: &mut Vec<f32>, tolerance: impl Fn(f32) -> f32) -> Option<BinStats> {
     let level = Level::current();
-    let blocks = logits.len().div_ceil(BLOCK);
+    let blocks = logits.len().div_ceil(BLOCK_BINS);
     scratch.clear();
     scratch.resize(logits.len() + blocks, 0.0);
     let (weights, sums) = scratch.split_at_mut(logits.len());
@@ -43,7 +43,7 @@ fn median(weights: &[f32], sums: &[f32], half: f32) -> f32 {
             below += sum;
             continue;
         }
-        let start = block * BLOCK;
+        let start = block * BLOCK_BINS;
         for (k, &w) in weights[start..].iter().enumerate() {
             if below + w >= half {
                 return (start + k) as f32 + ((half - below) / w).clamp(0.0, 1.0);
@@ -55,7 +55,7 @@ fn median(weights: &[f32], sums: &[f32], half: f32) -> f32 {
 }
 
 #[inline(always)]
-fn exponentials_body<const LANES: usize>(logits: &[f32], weights: &mut [f32], sums: &mut [f32]) -> f32 {
+fn exponentials_body<S: Isa>(isa: S, logits: &[f32], weights: &mut [f32], sums: &mut [f32]) -> f32 {
     let mut lanes = [f32::NEG_INFINITY; 16];
     for chunk in logits.chunks(16) {
         for (l, &s) in lanes.iter_mut().zip(chunk) {
@@ -63,12 +63,12 @@ fn exponentials_body<const LANES: usize>(logits: &[f32], weights: &mut [f32], su
         }
     }
     let max = lanes.iter().fold(f32::NEG_INFINITY, |a, &b| if b > a { b } else { a });
-    let blocks = logits.chunks(BLOCK).zip(weights.chunks_mut(BLOCK));
+    let blocks = logits.chunks(BLOCK_BINS).zip(weights.chunks_mut(BLOCK_BINS));
     for ((logits, weights), sum) in blocks.zip(sums) {
         let mut lanes = [0f32; 16];
         for (logits, weights) in logits.chunks(16).zip(weights.chunks_mut(16)) {
             for ((w, &l), lane) in weights.iter_mut().zip(logits).zip(&mut lanes) {
-                *w = exp::<LANES>(l - max);
+                *w = exp(isa, l - max);
                 *lane += *w;
             }
         }
@@ -78,7 +78,7 @@ fn exponentials_body<const LANES: usize>(logits: &[f32], weights: &mut [f32], su
 }
 
 #[inline(always)]
-fn distances_body<const LANES: usize>(weights: &[f32], median: f32, tolerance: f32) -> (f32, f32) {
+fn distances_body<S: Isa>(_: S, weights: &[f32], median: f32, tolerance: f32) -> (f32, f32) {
     let (mut off, mut near) = ([0f32; 16], [0f32; 16]);
     let mut centres: [f32; 16] = std::array::from_fn(|i| i as f32 + 0.5 - median);
     for chunk in weights.chunks(16) {

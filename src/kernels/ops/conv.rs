@@ -2,14 +2,13 @@
 
 use crate::error::Result;
 use crate::kernels::exec::{dims4, expect_dims, on_cpu, output, read, read2, slice, sum_in_order, tensor};
-use crate::kernels::gemm::f32::panels::{Lhs, Panels};
-use crate::kernels::gemm::f32::product::{Init, multiply};
-use crate::kernels::isa::level::Level;
+use crate::kernels::gemm::f32::{Init, Lhs, Panels, multiply};
+use crate::kernels::isa::Level;
 use candle_core::{CpuStorage, CustomOp2, CustomOp3, Layout, Shape, Tensor};
 use rayon::prelude::*;
 
 /// Image rows in one task.
-const ROWS: usize = 16;
+const TASK_ROWS: usize = 16;
 
 /// 3x3 convolution (cross-correlation, as networks have it), stride 1, zero padding 1.
 ///
@@ -55,13 +54,13 @@ struct Images {
 
 impl Images {
     fn tasks_per_image(self) -> usize {
-        self.h.div_ceil(ROWS)
+        self.h.div_ceil(TASK_ROWS)
     }
 
     /// First image row (counted over the batch) and number of rows of a task: never of two images.
     fn task(self, i: usize) -> (usize, usize) {
-        let (image, y) = (i / self.tasks_per_image(), i % self.tasks_per_image() * ROWS);
-        (image * self.h + y, ROWS.min(self.h - y))
+        let (image, y) = (i / self.tasks_per_image(), i % self.tasks_per_image() * TASK_ROWS);
+        (image * self.h + y, TASK_ROWS.min(self.h - y))
     }
 
     fn tasks(self) -> usize {

@@ -4,17 +4,16 @@ use crate::error::Result;
 use crate::kernels::exec::{
     chunk_rows, dims2, expect_dims, map_chunks, on_cpu, output, read, read2, slice, sum_in_order, tensor,
 };
-use crate::kernels::gemm::f32::panels::{Lhs, Panels};
-use crate::kernels::gemm::f32::product::{Init, multiply};
-use crate::kernels::isa::level::{Level, per_level};
-use crate::kernels::simd::math::dot;
+use crate::kernels::gemm::f32::{Init, Lhs, Panels, multiply};
+use crate::kernels::isa::{Isa, Level, per_level};
+use crate::kernels::simd::dot;
 use candle_core::{CpuStorage, CustomOp2, CustomOp3, Layout, Shape, Tensor};
 use rayon::prelude::*;
 
 /// Rows of the product in one task.
-const ROWS: usize = 96;
+const TASK_ROWS: usize = 96;
 /// Rows summed in one task of the weight's gradient.
-const SUM_ROWS: usize = 1024;
+const GRADIENT_TASK_ROWS: usize = 1024;
 
 /// `x W^T + b`.
 ///
@@ -56,7 +55,7 @@ fn forward(x: &[f32], weight: &[f32], bias: Option<&[f32]>, n: usize, k: usize, 
     product(x, n, k, &Panels::from_columns(weight, k, k, m), m, bias.map_or(Init::Zero, Init::Bias))
 }
 
-/// For the few rows of a decoding step: reads each row of the weight once, as it lies.
+/// For the few rows of a decode step: reads each row of the weight once, as it lies.
 fn by_dots(x: &[f32], weight: &[f32], bias: Option<&[f32]>, n: usize, k: usize, m: usize) -> Vec<f32> {
     let level = Level::current();
     let rows = chunk_rows(k, 32 * 1024);
@@ -69,14 +68,14 @@ fn by_dots(x: &[f32], weight: &[f32], bias: Option<&[f32]>, n: usize, k: usize, 
 }
 
 #[inline(always)]
-fn dots_body<const LANES: usize>(out: &mut [f32], x: &[f32], weight: &[f32], k: usize) {
+fn dots_body<S: Isa>(isa: S, out: &mut [f32], x: &[f32], weight: &[f32], k: usize) {
     if k == 0 {
         return;
     }
     let n = x.len() / k;
     for (out, w) in out.chunks_exact_mut(n).zip(weight.chunks_exact(k)) {
         for (o, x) in out.iter_mut().zip(x.chunks_exact(k)) {
-            *o = dot::<LANES>(w, x);
+            *o = dot(isa, w, x);
         }
     }
 }
@@ -101,9 +100,9 @@ fn product(x: &[f32], n: usize, k: usize, rhs: &Panels<'_>, m: usize, init: Init
     let level = Level::current();
     let mut out = vec![0f32; n * m];
     if m > 0 {
-        out.par_chunks_mut(ROWS * m).enumerate().for_each(|(i, out)| {
+        out.par_chunks_mut(TASK_ROWS * m).enumerate().for_each(|(i, out)| {
             let rows = out.len() / m;
-            let x = &x[i * ROWS * k..(i * ROWS + rows) * k];
+            let x = &x[i * TASK_ROWS * k..(i * TASK_ROWS + rows) * k];
             multiply(level, out, m, rows, Lhs::rows(x, k, k), rhs.view(), init);
         });
     }
@@ -156,9 +155,9 @@ fn finish(transposed: Vec<f32>, n: usize, m: usize, bias: Option<&[f32]>) -> Vec
 /// `grad^T x`: `[m, k]`.
 fn weight_grad(grad: &[f32], x: &[f32], n: usize, k: usize, m: usize) -> Vec<f32> {
     let level = Level::current();
-    let partials = map_chunks(n.div_ceil(SUM_ROWS), |i| {
-        let rows = SUM_ROWS.min(n - i * SUM_ROWS);
-        let from = i * SUM_ROWS;
+    let partials = map_chunks(n.div_ceil(GRADIENT_TASK_ROWS), |i| {
+        let rows = GRADIENT_TASK_ROWS.min(n - i * GRADIENT_TASK_ROWS);
+        let from = i * GRADIENT_TASK_ROWS;
         let rhs = Panels::from_rows(&x[from * k..], k, rows, k);
         let mut out = vec![0f32; m * k];
         let lhs = Lhs::columns(&grad[from * m..(from + rows) * m], m, rows);

@@ -2,13 +2,16 @@
 
 use crate::error::Result;
 use crate::kernels::exec::{
-    chunk_rows, dims2, expect_dims, on_cpu, output, read3, slice, sum_in_order, tensor, written,
+    chunk_rows, dims2, expect_dims, on_cpu, output, read3, slice, sum_in_order, tensor,
 };
-use crate::kernels::isa::level::{Level, per_level};
+use crate::kernels::isa::{Isa, Level, per_level};
+use crate::kernels::written::written;
 use candle_core::{CpuStorage, CustomOp2, D, Layout, Shape, Tensor};
 use rayon::prelude::*;
+use std::mem::MaybeUninit;
 
-const CHUNK: usize = 16 * 1024;
+/// Elements of a task, about.
+const CHUNK_ELEMENTS: usize = 16 * 1024;
 
 /// `x / sqrt(mean(x^2) + eps) * weight`, the mean over each row.
 ///
@@ -49,19 +52,20 @@ fn lane_sum(len: usize, f: impl Fn(usize) -> f32) -> f32 {
 }
 
 #[inline(always)]
-fn forward_body<const LANES: usize>(out: &mut [f32], x: &[f32], weight: &[f32], eps: f32) {
+fn forward_body<S: Isa>(_: S, out: &mut [MaybeUninit<f32>], x: &[f32], weight: &[f32], eps: f32) {
     let d = weight.len();
     for (out, x) in out.chunks_exact_mut(d).zip(x.chunks_exact(d)) {
         let scale = 1.0 / (lane_sum(d, |i| x[i] * x[i]) / d as f32 + eps).sqrt();
         for ((o, &x), &w) in out.iter_mut().zip(x).zip(weight) {
-            *o = x * scale * w;
+            o.write(x * scale * w);
         }
     }
 }
-per_level!(fn forward_chunk(out: &mut [f32], x: &[f32], weight: &[f32], eps: f32) = forward_body);
+per_level!(fn forward_chunk(out: &mut [MaybeUninit<f32>], x: &[f32], weight: &[f32], eps: f32) = forward_body);
 
 #[inline(always)]
-fn backward_body<const LANES: usize>(
+fn backward_body<S: Isa>(
+    _: S,
     dx: &mut [f32],
     dw: &mut [f32],
     x: &[f32],
@@ -97,8 +101,8 @@ impl CustomOp2 for RmsNorm {
     ) -> candle_core::Result<(CpuStorage, Shape)> {
         let (x, weight) = (slice(s1, l1)?, slice(s2, l2)?);
         let level = Level::current();
-        let chunk = (chunk_rows(weight.len(), CHUNK) * weight.len()).max(1);
-        let rows = |out: &mut [f32]| {
+        let chunk = (chunk_rows(weight.len(), CHUNK_ELEMENTS) * weight.len()).max(1);
+        let rows = |out: &mut [MaybeUninit<f32>]| {
             out.par_chunks_mut(chunk)
                 .zip(x.par_chunks(chunk))
                 .for_each(|(o, x)| forward_chunk(level, o, x, weight, self.eps));
@@ -119,7 +123,7 @@ impl CustomOp2 for RmsNorm {
         let (dx, dw) = read3(x, weight, grad, |x, w, g| {
             let d = w.len();
             let mut dx = vec![0f32; x.len()];
-            let chunk = (chunk_rows(d, CHUNK) * d).max(1);
+            let chunk = (chunk_rows(d, CHUNK_ELEMENTS) * d).max(1);
             let partials: Vec<Vec<f32>> = dx
                 .par_chunks_mut(chunk)
                 .zip(x.par_chunks(chunk).zip(g.par_chunks(chunk)))

@@ -1,13 +1,16 @@
 //! Rotary position embedding.
 
 use crate::error::{Error, Result};
-use crate::kernels::exec::{chunk_rows, dims2, expect_dims, on_cpu, output, read2, slice, written};
-use crate::kernels::isa::level::{Level, per_level};
-use crate::kernels::simd::math::madd;
+use crate::kernels::exec::{chunk_rows, dims2, expect_dims, on_cpu, output, read2, slice};
+use crate::kernels::isa::{Isa, Level, per_level};
+use crate::kernels::simd::madd;
+use crate::kernels::written::written;
 use candle_core::{CpuStorage, CustomOp1, Layout, Shape, Tensor};
 use rayon::prelude::*;
+use std::mem::MaybeUninit;
 
-const CHUNK: usize = 16 * 1024;
+/// Elements of a task, about.
+const CHUNK_ELEMENTS: usize = 16 * 1024;
 
 /// Turns each head's pairs `(x[i], x[i + hd/2])` by the angle whose cosine and sine are given.
 ///
@@ -48,11 +51,11 @@ struct Rope {
 }
 
 #[inline(always)]
-fn rope_body<const LANES: usize>(
-    out: &mut [f32],
+fn rope_body<S: Isa>(
+    isa: S,
+    out: &mut [MaybeUninit<f32>],
     x: &[f32],
-    cos: &[f32],
-    sin: &[f32],
+    [cos, sin]: [&[f32]; 2],
     half: usize,
     heads: usize,
     sign: f32,
@@ -65,13 +68,13 @@ fn rope_body<const LANES: usize>(
             let (a, b) = x.split_at(half);
             for i in 0..half {
                 let s = sign * sin[i];
-                first[i] = madd::<LANES>(a[i], cos[i], -(b[i] * s));
-                second[i] = madd::<LANES>(b[i], cos[i], a[i] * s);
+                first[i].write(madd(isa, a[i], cos[i], -(b[i] * s)));
+                second[i].write(madd(isa, b[i], cos[i], a[i] * s));
             }
         }
     }
 }
-per_level!(fn rope_chunk(out: &mut [f32], x: &[f32], cos: &[f32], sin: &[f32], half: usize, heads: usize, sign: f32) = rope_body);
+per_level!(fn rope_chunk(out: &mut [MaybeUninit<f32>], x: &[f32], angles: [&[f32]; 2], half: usize, heads: usize, sign: f32) = rope_body);
 
 impl CustomOp1 for Rope {
     fn name(&self) -> &'static str {
@@ -86,14 +89,14 @@ impl CustomOp1 for Rope {
         if n * half == 0 {
             return Ok(output(Vec::new(), l.shape().clone()));
         }
-        let rows = chunk_rows(width, CHUNK);
+        let rows = chunk_rows(width, CHUNK_ELEMENTS);
         let sign = if self.back { -1.0 } else { 1.0 };
         let out = read2(&self.cos, &self.sin, |cos, sin| {
             let angles = cos.par_chunks(rows * half).zip(sin.par_chunks(rows * half));
             let inputs = x.par_chunks(rows * width).zip(angles);
-            let turned = |out: &mut [f32]| {
+            let turned = |out: &mut [MaybeUninit<f32>]| {
                 out.par_chunks_mut(rows * width).zip(inputs).for_each(|(o, (x, (cos, sin)))| {
-                    rope_chunk(level, o, x, cos, sin, half, self.heads, sign);
+                    rope_chunk(level, o, x, [cos, sin], half, self.heads, sign);
                 });
             };
             // SAFETY: there are as many angles as rows of `x`; of each row both halves of each head are written.

@@ -1,15 +1,16 @@
 //! Scale and shift per channel with LeakyReLU, and batch normalisation by its own statistics.
 
 use crate::error::{Error, Result};
-use crate::kernels::exec::{chunk_rows, dims4, expect_dims, on_cpu, output, read3, slice, tensor};
-use crate::kernels::isa::level::{Level, per_level};
-use crate::kernels::simd::math::madd;
+use crate::kernels::exec::{chunk_rows, dims4, expect_dims, on_cpu, output, read, read3, slice, tensor};
+use crate::kernels::isa::{Isa, Level, per_level};
+use crate::kernels::simd::madd;
 use candle_core::{CpuStorage, CustomOp3, Layout, Shape, Tensor};
 use rayon::prelude::*;
 
-const CHUNK: usize = 32 * 1024;
+/// Elements of a task, about.
+const CHUNK_ELEMENTS: usize = 32 * 1024;
 /// Pixels whose channels are worked on as one vector.
-const GROUP: usize = 16;
+const GROUP_PIXELS: usize = 16;
 
 /// `leaky(x * scale + shift)` per channel, where `leaky(z)` = z for z > 0, else `slope` z.
 ///
@@ -50,7 +51,7 @@ pub fn batch_norm_act(
         return batch_norm_composed(x, gamma, beta, eps, slope);
     }
     let x = x.contiguous()?;
-    let (mean, var) = crate::kernels::exec::read(&x, |x| Ok(statistics(x, c)))?;
+    let (mean, var) = read(&x, |x| Ok(statistics(x, c)))?;
     let inverse = var.iter().map(|v| (1.0 / (*v as f64 + eps).sqrt()) as f32).collect();
     let op = ScaleShift { statistics: Some((mean.clone(), inverse)), slope: slope as f32 };
     let out = x.apply_op3(&gamma.contiguous()?, &beta.contiguous()?, op)?;
@@ -85,9 +86,9 @@ struct ScaleShift {
     slope: f32,
 }
 
-/// `row` repeated so that every vector of `GROUP` pixels meets its channels in place.
+/// `row` repeated so that every vector of `GROUP_PIXELS` pixels meets its channels in place.
 fn repeated(row: &[f32]) -> Vec<f32> {
-    row.repeat(GROUP)
+    row.repeat(GROUP_PIXELS)
 }
 
 /// Folds sums over repeated channels into sums over channels.
@@ -102,11 +103,11 @@ fn folded(sums: &[Vec<f32>], c: usize) -> Vec<f64> {
 }
 
 #[inline(always)]
-fn apply_body<const LANES: usize>(out: &mut [f32], x: &[f32], scale: &[f32], shift: &[f32], slope: f32) {
+fn apply_body<S: Isa>(isa: S, out: &mut [f32], x: &[f32], scale: &[f32], shift: &[f32], slope: f32) {
     let width = scale.len();
     for (out, x) in out.chunks_mut(width).zip(x.chunks(width)) {
         for (((o, &x), &a), &b) in out.iter_mut().zip(x).zip(scale).zip(shift) {
-            let z = madd::<LANES>(x, a, b);
+            let z = madd(isa, x, a, b);
             *o = if z > 0.0 { z } else { z * slope };
         }
     }
@@ -115,12 +116,12 @@ per_level!(fn apply_chunk(out: &mut [f32], x: &[f32], scale: &[f32], shift: &[f3
 
 /// Adds to `sum` the deviations from `centre`, to `squares` their squares.
 #[inline(always)]
-fn moments_body<const LANES: usize>(x: &[f32], centre: &[f32], sum: &mut [f32], squares: &mut [f32]) {
+fn moments_body<S: Isa>(isa: S, x: &[f32], centre: &[f32], sum: &mut [f32], squares: &mut [f32]) {
     for x in x.chunks(centre.len()) {
         for (((&x, &m), s), q) in x.iter().zip(centre).zip(&mut *sum).zip(&mut *squares) {
             let d = x - m;
             *s += d;
-            *q = madd::<LANES>(d, d, *q);
+            *q = madd(isa, d, d, *q);
         }
     }
 }
@@ -139,7 +140,7 @@ fn statistics(x: &[f32], c: usize) -> (Vec<f32>, Vec<f32>) {
     }
     centre.iter_mut().for_each(|m| *m /= (first.len() / c) as f32);
     let wide = repeated(&centre);
-    let chunk = chunk_rows(wide.len(), CHUNK) * wide.len();
+    let chunk = chunk_rows(wide.len(), CHUNK_ELEMENTS) * wide.len();
     let (sums, squares): (Vec<_>, Vec<_>) = x
         .par_chunks(chunk)
         .map(|x| {
@@ -157,11 +158,11 @@ fn statistics(x: &[f32], c: usize) -> (Vec<f32>, Vec<f32>) {
 
 /// Sums of dz and of dz * x, where dz is the gradient before the activation.
 #[inline(always)]
-fn sums_body<const LANES: usize>(
+fn sums_body<S: Isa>(
+    isa: S,
     x: &[f32],
     grad: &[f32],
-    scale: &[f32],
-    shift: &[f32],
+    [scale, shift]: [&[f32]; 2],
     slope: f32,
     sum: &mut [f32],
     dot: &mut [f32],
@@ -170,24 +171,24 @@ fn sums_body<const LANES: usize>(
     for (x, grad) in x.chunks(width).zip(grad.chunks(width)) {
         let sums = sum.iter_mut().zip(dot.iter_mut());
         for ((((&x, &g), &a), &b), (s, d)) in x.iter().zip(grad).zip(scale).zip(shift).zip(sums) {
-            let dz = if madd::<LANES>(x, a, b) > 0.0 { g } else { g * slope };
+            let dz = if madd(isa, x, a, b) > 0.0 { g } else { g * slope };
             *s += dz;
-            *d = madd::<LANES>(dz, x, *d);
+            *d = madd(isa, dz, x, *d);
         }
     }
 }
-per_level!(fn sums_chunk(x: &[f32], grad: &[f32], scale: &[f32], shift: &[f32], slope: f32, sum: &mut [f32], dot: &mut [f32]) = sums_body);
+per_level!(fn sums_chunk(x: &[f32], grad: &[f32], channels: [&[f32]; 2], slope: f32, sum: &mut [f32], dot: &mut [f32]) = sums_body);
 
 /// `dx = dz * scale + x * by_x + constant`; `channels` are scale, shift, by_x and constant.
 #[inline(always)]
-fn dx_body<const LANES: usize>(dx: &mut [f32], x: &[f32], grad: &[f32], channels: [&[f32]; 4], slope: f32) {
+fn dx_body<S: Isa>(isa: S, dx: &mut [f32], x: &[f32], grad: &[f32], channels: [&[f32]; 4], slope: f32) {
     let [scale, shift, by_x, constant] = channels;
     let width = scale.len();
     for ((dx, x), grad) in dx.chunks_mut(width).zip(x.chunks(width)).zip(grad.chunks(width)) {
         let channels = scale.iter().zip(shift).zip(by_x.iter().zip(constant));
         for (((dx, &x), &g), ((&a, &b), (&p, &q))) in dx.iter_mut().zip(x).zip(grad).zip(channels) {
-            let dz = if madd::<LANES>(x, a, b) > 0.0 { g } else { g * slope };
-            *dx = madd::<LANES>(dz, a, madd::<LANES>(x, p, q));
+            let dz = if madd(isa, x, a, b) > 0.0 { g } else { g * slope };
+            *dx = madd(isa, dz, a, madd(isa, x, p, q));
         }
     }
 }
@@ -210,13 +211,13 @@ impl ScaleShift {
         let c = first.len();
         let (scale, shift) = self.fold(first, second);
         let (a, b) = (repeated(&scale), repeated(&shift));
-        let chunk = chunk_rows(a.len(), CHUNK) * a.len();
+        let chunk = chunk_rows(a.len(), CHUNK_ELEMENTS) * a.len();
         let (sums, dots): (Vec<_>, Vec<_>) = x
             .par_chunks(chunk)
             .zip(grad.par_chunks(chunk))
             .map(|(x, grad)| {
                 let (mut sum, mut dot) = (vec![0f32; a.len()], vec![0f32; a.len()]);
-                sums_chunk(level, x, grad, &a, &b, self.slope, &mut sum, &mut dot);
+                sums_chunk(level, x, grad, [&a, &b], self.slope, &mut sum, &mut dot);
                 (sum, dot)
             })
             .unzip();
@@ -264,7 +265,7 @@ impl CustomOp3 for ScaleShift {
         let (x, level) = (slice(s1, l1)?, Level::current());
         let (scale, shift) = self.fold(slice(s2, l2)?, slice(s3, l3)?);
         let (scale, shift) = (repeated(&scale), repeated(&shift));
-        let chunk = chunk_rows(scale.len(), CHUNK) * scale.len();
+        let chunk = chunk_rows(scale.len(), CHUNK_ELEMENTS) * scale.len();
         let mut out = vec![0f32; x.len()];
         out.par_chunks_mut(chunk)
             .zip(x.par_chunks(chunk))
@@ -280,7 +281,7 @@ impl CustomOp3 for ScaleShift {
         _res: &Tensor,
         grad: &Tensor,
     ) -> candle_core::Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
-        let [dx, d_first, d_second] = crate::kernels::exec::read(grad, |grad| {
+        let [dx, d_first, d_second] = read(grad, |grad| {
             read3(x, first, second, |x, first, second| Ok(self.backward(x, first, second, grad)))
         })?;
         Ok((

@@ -1,4 +1,7 @@
 //! Attention in f32, with gradients.
 
-pub(in crate::kernels) mod op;
-pub(in crate::kernels) mod tile;
+mod op;
+mod softmax;
+mod tile;
+
+pub(super) use op::F32Attention;

@@ -1,83 +1,90 @@
-//! Attention on the CPU: tiles of query rows against packed keys, forward and backward.
+//! The operation: tiles of query rows against packed keys, forward and backward.
 
-use crate::kernels::attention::f32::tile::{Data, Given, Packed, Scratch, Work};
+use super::tile::{BackwardInputs, PackedSet, TileBuffers, TileWork};
+use crate::kernels::attention::inputs::Inputs;
 use crate::kernels::attention::layout::AttentionLayout;
 use crate::kernels::attention::plan::Plan;
 use crate::kernels::exec::{output, read2, read3, slice, tensor};
-use crate::kernels::gemm::f32::panels::Panels;
-use crate::kernels::isa::level::Level;
+use crate::kernels::gemm::f32::Panels;
+use crate::kernels::isa::Level;
 use candle_core::{CpuStorage, CustomOp3, Layout, Shape, Tensor};
 use rayon::prelude::*;
 use std::sync::OnceLock;
 
-pub(in crate::kernels) struct Attention {
-    pub(in crate::kernels) layout: AttentionLayout,
-    pub(in crate::kernels) plan: Plan,
+pub(in crate::kernels::attention) struct F32Attention {
+    layout: AttentionLayout,
+    plan: Plan,
     /// The extra pair that shared keys and values come from.
     shared: Option<(Tensor, Tensor)>,
     /// Log-sum-exp of each row's scores, `[nq, heads]`, from the forward pass for the backward.
     lse: OnceLock<Vec<f32>>,
 }
 
-impl Attention {
-    pub(in crate::kernels) fn new(layout: AttentionLayout, shared: Option<(Tensor, Tensor)>) -> Self {
+impl F32Attention {
+    pub(in crate::kernels::attention) fn new(
+        layout: AttentionLayout,
+        shared: Option<(Tensor, Tensor)>,
+    ) -> Self {
         let plan = Plan::new(&layout, shared.is_some());
-        Attention { layout, plan, shared, lse: OnceLock::new() }
-    }
-
-    pub(in crate::kernels) fn scale(&self) -> f32 {
-        1.0 / (self.layout.head_dim as f32).sqrt()
+        F32Attention { layout, plan, shared, lse: OnceLock::new() }
     }
 
     /// Runs `f` on the data, with the extra pair if there is one.
     fn with_extra<R>(
         &self,
         [q, k, v]: [&[f32]; 3],
-        f: impl FnOnce(Data<'_>) -> candle_core::Result<R>,
+        f: impl FnOnce(Inputs<'_>) -> candle_core::Result<R>,
     ) -> candle_core::Result<R> {
         match &self.shared {
-            None => f(Data { q, k, v, extra: None }),
-            Some((sk, sv)) => read2(sk, sv, |sk, sv| f(Data { q, k, v, extra: Some((sk, sv)) })),
+            None => f(Inputs { q, k, v, extra: None }),
+            Some((sk, sv)) => read2(sk, sv, |sk, sv| f(Inputs { q, k, v, extra: Some((sk, sv)) })),
         }
     }
 
     /// Packs every key set for every head: `[set * kv_heads + head]`.
-    fn pack<'b>(&self, data: Data<'b>, back: bool) -> Vec<Packed<'b>> {
+    fn pack_key_sets<'b>(&self, data: Inputs<'b>, backward: bool) -> Vec<PackedSet<'b>> {
         let AttentionLayout { kv_heads, head_dim: hd, .. } = self.layout;
         let width = kv_heads * hd;
         let one = |i: usize| {
             let set = &self.plan.sets[i / kv_heads];
-            let (k, v) = match data.extra {
-                Some(pair) if set.extra => pair,
-                _ => (data.k, data.v),
-            };
-            let (from, n) = (set.rows.start * width + i % kv_heads * hd, set.rows.len());
-            let (k, v) = (&k[from..], &v[from..]);
-            Packed {
-                keys: back.then(|| Panels::from_rows(k, width, n, hd)),
+            let (k, v) = data.keys_and_values(set, width, i % kv_heads * hd);
+            let n = set.rows.len();
+            PackedSet {
+                keys: backward.then(|| Panels::from_rows(k, width, n, hd)),
                 keys_t: Panels::from_columns(k, width, hd, n),
                 values: Panels::from_rows(v, width, n, hd),
-                values_t: back.then(|| Panels::from_columns(v, width, hd, n)),
+                values_t: backward.then(|| Panels::from_columns(v, width, hd, n)),
             }
         };
         (0..self.plan.sets.len() * kv_heads).into_par_iter().map(one).collect()
     }
 
+    /// The work of one tile for one key head.
+    fn work<'b>(
+        &'b self,
+        (level, data): (Level, Inputs<'b>),
+        packed: &'b [PackedSet<'b>],
+        tile: usize,
+        head: usize,
+    ) -> TileWork<'b> {
+        TileWork { layout: &self.layout, plan: &self.plan, level, data, packed, tile, head }
+    }
+
     /// Output `[nq, heads * head_dim]` and log-sum-exp `[nq, heads]`.
-    fn forward(&self, data: Data<'_>) -> (Vec<f32>, Vec<f32>) {
+    fn forward(&self, data: Inputs<'_>) -> (Vec<f32>, Vec<f32>) {
         let AttentionLayout { heads, kv_heads, head_dim, .. } = self.layout;
-        let packed = self.pack(data, false);
+        let packed = self.pack_key_sets(data, false);
         let mut out = vec![0f32; data.q.len()];
         let mut lse = vec![0f32; data.q.len() / head_dim];
         let level = Level::current();
         let (outs, lses) = (self.plan.split(&mut out, heads * head_dim), self.plan.split(&mut lse, heads));
         outs.into_par_iter().zip(lses).enumerate().for_each_init(
-            Scratch::default,
+            TileBuffers::default,
             |scratch, (tile, (out, lse))| {
                 for head in 0..kv_heads {
-                    let work = Work { op: self, level, data, packed: &packed, tile, head };
+                    let work = self.work((level, data), &packed, tile, head);
                     if head == 0 {
-                        work.survey(scratch);
+                        work.note_visible_keys(scratch);
                     }
                     work.forward(scratch, out, lse);
                 }
@@ -87,10 +94,10 @@ impl Attention {
     }
 
     /// Gradients of q, k and v. One task per key head and span of keys: each adds up its own.
-    fn backward(&self, data: Data<'_>, given: Given<'_>) -> [Vec<f32>; 3] {
+    fn backward(&self, data: Inputs<'_>, given: BackwardInputs<'_>) -> [Vec<f32>; 3] {
         let AttentionLayout { heads, kv_heads, head_dim: hd, .. } = self.layout;
         let part = heads / kv_heads * hd;
-        let (packed, level, spans) = (self.pack(data, true), Level::current(), self.plan.spans());
+        let (packed, level, spans) = (self.pack_key_sets(data, true), Level::current(), self.plan.spans());
         let nq = data.q.len() / (heads * hd);
         let nk = data.k.len() / (kv_heads * hd);
         let (mut dq, mut dk, mut dv) =
@@ -112,11 +119,11 @@ impl Attention {
                 tasks.push((head, span.start, tiles, own_k, own_v));
             }
         }
-        tasks.into_par_iter().for_each_init(Scratch::default, |scratch, task| {
+        tasks.into_par_iter().for_each_init(TileBuffers::default, |scratch, task| {
             let (head, base, tiles, dk, dv) = task;
             for (tile, dq) in tiles {
-                let work = Work { op: self, level, data, packed: &packed, tile, head };
-                work.survey(scratch);
+                let work = self.work((level, data), &packed, tile, head);
+                work.note_visible_keys(scratch);
                 work.backward(scratch, given, dq, dk, dv, base);
             }
         });
@@ -143,7 +150,7 @@ fn rows_first(data: Vec<f32>, n: usize, width: usize) -> Vec<f32> {
     out
 }
 
-impl CustomOp3 for Attention {
+impl CustomOp3 for F32Attention {
     fn name(&self) -> &'static str {
         "attention"
     }
@@ -159,7 +166,7 @@ impl CustomOp3 for Attention {
     ) -> candle_core::Result<(CpuStorage, Shape)> {
         let qkv = [slice(s1, l1)?, slice(s2, l2)?, slice(s3, l3)?];
         let (out, lse) = self.with_extra(qkv, |data| Ok(self.forward(data)))?;
-        // Set once: an operation runs forward once.
+        // An operation runs forward once, so nothing is set yet.
         let _ = self.lse.set(lse);
         Ok(output(out, l1.shape().clone()))
     }
@@ -177,7 +184,7 @@ impl CustomOp3 for Attention {
         };
         let [dq, dk, dv] = read2(res, grad, |out, grad| {
             read3(q, k, v, |q, k, v| {
-                let given = Given { out, grad, lse };
+                let given = BackwardInputs { out, grad, lse };
                 self.with_extra([q, k, v], |data| Ok(self.backward(data, given)))
             })
         })?;

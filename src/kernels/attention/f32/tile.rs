@@ -1,35 +1,25 @@
 //! Attention of one tile of query rows for one key head, forward and backward.
 
-use crate::kernels::attention::f32::op::Attention;
-use crate::kernels::attention::plan::Own;
-use crate::kernels::attention::rows::{
-    Rows, pair_dots, row_dots, row_scatter, row_sums, softmax, softmax_grad,
-};
-use crate::kernels::gemm::f32::panels::{Lhs, Panels};
-use crate::kernels::gemm::f32::product::{Init, multiply};
-use crate::kernels::isa::level::Level;
-
-/// Query, key and value rows, and the extra pair's.
-#[derive(Clone, Copy)]
-pub(in crate::kernels) struct Data<'a> {
-    pub(in crate::kernels) q: &'a [f32],
-    pub(in crate::kernels) k: &'a [f32],
-    pub(in crate::kernels) v: &'a [f32],
-    pub(in crate::kernels) extra: Option<(&'a [f32], &'a [f32])>,
-}
+use super::softmax::{pair_dots, softmax_grad, softmax_rows};
+use crate::kernels::attention::inputs::Inputs;
+use crate::kernels::attention::layout::AttentionLayout;
+use crate::kernels::attention::own_keys::{OwnRows, row_dots, row_scatter, row_sums};
+use crate::kernels::attention::plan::{OwnKeys, Plan};
+use crate::kernels::gemm::f32::{Init, Lhs, Panels, multiply};
+use crate::kernels::isa::Level;
 
 /// One key set of one head, packed as the products need it.
-pub(in crate::kernels) struct Packed<'a> {
+pub(super) struct PackedSet<'a> {
     /// `[n, head_dim]` and its transpose.
-    pub(in crate::kernels) keys: Option<Panels<'a>>,
-    pub(in crate::kernels) keys_t: Panels<'a>,
-    pub(in crate::kernels) values: Panels<'a>,
-    pub(in crate::kernels) values_t: Option<Panels<'a>>,
+    pub(super) keys: Option<Panels<'a>>,
+    pub(super) keys_t: Panels<'a>,
+    pub(super) values: Panels<'a>,
+    pub(super) values_t: Option<Panels<'a>>,
 }
 
 /// A tile's matrices, kept between tiles.
 #[derive(Default)]
-pub(in crate::kernels) struct Scratch {
+pub(super) struct TileBuffers {
     /// `[rows * group, head_dim]`, times 1 / sqrt(head_dim).
     q: Vec<f32>,
     scores: Vec<f32>,
@@ -55,39 +45,45 @@ fn sized(buffer: &mut Vec<f32>, len: usize) -> &mut [f32] {
 
 /// The work of one tile for one key head.
 #[derive(Clone, Copy)]
-pub(in crate::kernels) struct Work<'a> {
-    pub(in crate::kernels) op: &'a Attention,
-    pub(in crate::kernels) level: Level,
-    pub(in crate::kernels) data: Data<'a>,
-    pub(in crate::kernels) packed: &'a [Packed<'a>],
-    pub(in crate::kernels) tile: usize,
-    pub(in crate::kernels) head: usize,
+pub(super) struct TileWork<'a> {
+    pub(super) layout: &'a AttentionLayout,
+    pub(super) plan: &'a Plan,
+    pub(super) level: Level,
+    pub(super) data: Inputs<'a>,
+    pub(super) packed: &'a [PackedSet<'a>],
+    pub(super) tile: usize,
+    pub(super) head: usize,
 }
 
-impl<'a> Work<'a> {
+impl<'a> TileWork<'a> {
     fn group(self) -> usize {
-        self.op.layout.heads / self.op.layout.kv_heads
+        self.layout.heads / self.layout.kv_heads
     }
 
     fn head_dim(self) -> usize {
-        self.op.layout.head_dim
+        self.layout.head_dim
+    }
+
+    /// What scores are multiplied by.
+    fn scale(self) -> f32 {
+        1.0 / (self.head_dim() as f32).sqrt()
     }
 
     /// Rows of the tile's matrices: query rows times heads of the group.
     fn m(self) -> usize {
-        self.op.plan.tiles[self.tile].rows.len() * self.group()
+        self.plan.tiles[self.tile].rows.len() * self.group()
     }
 
     fn shared(self) -> usize {
-        self.op.plan.blocks[self.tile].shared.len()
+        self.plan.blocks[self.tile].shared.len()
     }
 
     /// Keys that some row of the tile sees.
     fn width(self) -> usize {
         self.shared()
-            + match self.op.plan.tiles[self.tile].own {
-                Own::Set { seen, .. } => seen,
-                Own::Rows => self.op.plan.blocks[self.tile].k_period,
+            + match self.plan.tiles[self.tile].own {
+                OwnKeys::Set { seen, .. } => seen,
+                OwnKeys::Rows => self.plan.blocks[self.tile].k_period,
             }
     }
 
@@ -95,37 +91,29 @@ impl<'a> Work<'a> {
         self.width().next_multiple_of(16)
     }
 
-    fn set(self, set: usize) -> &'a Packed<'a> {
-        &self.packed[set * self.op.layout.kv_heads + self.head]
+    fn set(self, set: usize) -> &'a PackedSet<'a> {
+        &self.packed[set * self.layout.kv_heads + self.head]
     }
 
-    /// Fills in what each row of the tile sees.
-    pub(in crate::kernels) fn survey(self, scratch: &mut Scratch) {
-        let (plan, group, shared) = (&self.op.plan, self.group(), self.shared());
-        let (tile, block) = (&plan.tiles[self.tile], &plan.blocks[self.tile]);
-        scratch.seen.clear();
-        scratch.own.clear();
-        scratch.first.clear();
-        for r in 0..self.m() {
-            let row = tile.rows.start + r / group - block.queries.start;
-            let own = block.seen(row % block.q_period);
-            scratch.seen.push(shared + own);
-            scratch.own.push(own);
-            scratch.first.push(block.own_start + row / block.q_period * block.k_period);
-        }
+    /// Notes which keys each row of the tile sees.
+    pub(super) fn note_visible_keys(self, buffers: &mut TileBuffers) {
+        let TileBuffers { seen, own, first, .. } = buffers;
+        self.plan.visible_own_keys(self.tile, self.group(), 0..self.m(), (own, first));
+        seen.clear();
+        seen.extend(own.iter().map(|own| self.shared() + own));
     }
 
-    fn rows(self, first: &'a [usize], seen: &'a [usize]) -> Rows<'a> {
-        let (head_dim, kv_heads) = (self.head_dim(), self.op.layout.kv_heads);
+    fn rows(self, first: &'a [usize], seen: &'a [usize]) -> OwnRows<'a> {
+        let (head_dim, kv_heads) = (self.head_dim(), self.layout.kv_heads);
         let (stride, column) = (kv_heads * head_dim, self.head * head_dim);
-        Rows { first, seen, stride, column, head_dim }
+        OwnRows { first, seen, stride, column, head_dim }
     }
 
     /// Copies the tile's rows of the head's group out of `[nq, heads * head_dim]`.
     fn gather(self, to: &mut [f32], from: &[f32], scale: f32) {
         let part = self.group() * self.head_dim();
-        let width = self.op.layout.kv_heads * part;
-        let rows = self.op.plan.tiles[self.tile].rows.clone();
+        let width = self.layout.kv_heads * part;
+        let rows = self.plan.tiles[self.tile].rows.clone();
         for (row, to) in rows.zip(to.chunks_exact_mut(part)) {
             let at = row * width + self.head * part;
             for (t, f) in to.iter_mut().zip(&from[at..at + part]) {
@@ -140,20 +128,20 @@ impl<'a> Work<'a> {
         self,
         dst: &mut [f32],
         left: &[f32],
-        packed: impl Fn(&'a Packed<'a>) -> Option<&'a Panels<'a>>,
+        packed: impl Fn(&'a PackedSet<'a>) -> Option<&'a Panels<'a>>,
         right: &[f32],
-        rows: Rows<'_>,
+        rows: OwnRows<'_>,
     ) {
         let (hd, m, stride, shared) = (self.head_dim(), self.m(), self.stride(), self.shared());
-        let tile = &self.op.plan.tiles[self.tile];
+        let tile = &self.plan.tiles[self.tile];
         let lhs = Lhs::rows(left, hd, hd);
         if let Some(panels) = tile.shared.and_then(|set| packed(self.set(set))) {
             multiply(self.level, dst, stride, m, lhs, panels.view(), Init::Zero);
         }
         let dst = &mut dst[shared..];
         match tile.own {
-            Own::Rows => row_dots(self.level, dst, stride, left, right, rows),
-            Own::Set { set, seen } => {
+            OwnKeys::Rows => row_dots(self.level, dst, stride, left, right, rows),
+            OwnKeys::Set { set, seen } => {
                 if let Some(panels) = packed(self.set(set)) {
                     let rhs = panels.view().columns(seen);
                     multiply(self.level, dst, stride, m, lhs, rhs, Init::Zero);
@@ -167,12 +155,12 @@ impl<'a> Work<'a> {
         self,
         dst: &mut [f32],
         weights: &[f32],
-        packed: impl Fn(&'a Packed<'a>) -> Option<&'a Panels<'a>>,
+        packed: impl Fn(&'a PackedSet<'a>) -> Option<&'a Panels<'a>>,
         right: &[f32],
-        rows: Rows<'_>,
+        rows: OwnRows<'_>,
     ) {
         let (hd, m, stride, shared) = (self.head_dim(), self.m(), self.stride(), self.shared());
-        let tile = &self.op.plan.tiles[self.tile];
+        let tile = &self.plan.tiles[self.tile];
         match tile.shared.and_then(|set| packed(self.set(set))) {
             Some(panels) => {
                 let lhs = Lhs::rows(weights, stride, shared);
@@ -182,8 +170,8 @@ impl<'a> Work<'a> {
         }
         let weights = &weights[shared..];
         match tile.own {
-            Own::Rows => row_sums(self.level, dst, weights, stride, right, rows),
-            Own::Set { set, seen } => {
+            OwnKeys::Rows => row_sums(self.level, dst, weights, stride, right, rows),
+            OwnKeys::Set { set, seen } => {
                 if let Some(panels) = packed(self.set(set)) {
                     let (lhs, rhs) = (Lhs::rows(weights, stride, seen), panels.view().rows(seen));
                     multiply(self.level, dst, hd, m, lhs, rhs, Init::Add);
@@ -194,9 +182,9 @@ impl<'a> Work<'a> {
 
     /// `dst += weights^T left` for the tile's keys, `dst` being the key rows from `base` on. The
     /// extra pair's keys have no gradient.
-    fn scatter(self, dst: &mut [f32], base: usize, weights: &[f32], left: &[f32], rows: Rows<'_>) {
+    fn scatter(self, dst: &mut [f32], base: usize, weights: &[f32], left: &[f32], rows: OwnRows<'_>) {
         let (hd, m, stride, shared) = (self.head_dim(), self.m(), self.stride(), self.shared());
-        let plan = &self.op.plan;
+        let plan = self.plan;
         let tile = &plan.tiles[self.tile];
         let rhs = Panels::from_rows(left, hd, m, hd);
         if let Some(set) = tile.shared.map(|set| &plan.sets[set]).filter(|set| !set.extra) {
@@ -206,8 +194,8 @@ impl<'a> Work<'a> {
         }
         let weights = &weights[shared..];
         match tile.own {
-            Own::Rows => row_scatter(self.level, dst, base, weights, stride, left, rows),
-            Own::Set { set, seen } => {
+            OwnKeys::Rows => row_scatter(self.level, dst, base, weights, stride, left, rows),
+            OwnKeys::Set { set, seen } => {
                 let lhs = Lhs::columns(weights, stride, m);
                 let dst = &mut dst[(plan.sets[set].rows.start - base) * hd..];
                 multiply(self.level, dst, hd, seen, lhs, rhs.view(), Init::Add);
@@ -216,17 +204,17 @@ impl<'a> Work<'a> {
     }
 
     /// The head's part of `out` and `lse`, which are the tile's rows of all heads.
-    pub(in crate::kernels) fn forward(self, scratch: &mut Scratch, out: &mut [f32], lse: &mut [f32]) {
+    pub(super) fn forward(self, buffers: &mut TileBuffers, out: &mut [f32], lse: &mut [f32]) {
         let (hd, m, stride, group) = (self.head_dim(), self.m(), self.stride(), self.group());
-        let (part, heads) = (group * hd, self.op.layout.heads);
-        let rows = self.rows(&scratch.first, &scratch.own);
-        let q = sized(&mut scratch.q, m * hd);
-        let scores = sized(&mut scratch.scores, m * stride);
-        let result = sized(&mut scratch.out, m * hd);
-        let (maxima, totals) = (sized(&mut scratch.a, m), sized(&mut scratch.b, m));
-        self.gather(q, self.data.q, self.op.scale());
+        let (part, heads) = (group * hd, self.layout.heads);
+        let rows = self.rows(&buffers.first, &buffers.own);
+        let q = sized(&mut buffers.q, m * hd);
+        let scores = sized(&mut buffers.scores, m * stride);
+        let result = sized(&mut buffers.out, m * hd);
+        let (maxima, totals) = (sized(&mut buffers.a, m), sized(&mut buffers.b, m));
+        self.gather(q, self.data.q, self.scale());
         self.dots(scores, q, |p| Some(&p.keys_t), self.data.k, rows);
-        softmax(self.level, scores, stride, self.width(), &scratch.seen, maxima, totals);
+        softmax_rows(self.level, scores, stride, self.width(), &buffers.seen, maxima, totals);
         self.sums(result, scores, |p| Some(&p.values), self.data.v, rows);
         for r in 0..m {
             let (row, h) = (r / group, self.head * group + r % group);
@@ -241,35 +229,35 @@ impl<'a> Work<'a> {
 
     /// The tile's part of dq (`[rows, group * head_dim]`), and what it adds to dk and dv of the key
     /// rows from `base` on.
-    pub(in crate::kernels) fn backward(
+    pub(super) fn backward(
         self,
-        scratch: &mut Scratch,
-        given: Given<'_>,
+        buffers: &mut TileBuffers,
+        given: BackwardInputs<'_>,
         dq: &mut [f32],
         dk: &mut [f32],
         dv: &mut [f32],
         base: usize,
     ) {
         let (hd, m, stride, group) = (self.head_dim(), self.m(), self.stride(), self.group());
-        let scale = self.op.scale();
-        let rows = self.rows(&scratch.first, &scratch.own);
-        let q = sized(&mut scratch.q, m * hd);
-        let p = sized(&mut scratch.scores, m * stride);
-        let ds = sized(&mut scratch.score_grads, m * stride);
-        let (result, grad) = (sized(&mut scratch.out, m * hd), sized(&mut scratch.grad, m * hd));
-        let (lse, pulls) = (sized(&mut scratch.a, m), sized(&mut scratch.b, m));
+        let scale = self.scale();
+        let rows = self.rows(&buffers.first, &buffers.own);
+        let q = sized(&mut buffers.q, m * hd);
+        let p = sized(&mut buffers.scores, m * stride);
+        let ds = sized(&mut buffers.score_grads, m * stride);
+        let (result, grad) = (sized(&mut buffers.out, m * hd), sized(&mut buffers.grad, m * hd));
+        let (lse, pulls) = (sized(&mut buffers.a, m), sized(&mut buffers.b, m));
         self.gather(q, self.data.q, scale);
         self.gather(grad, given.grad, 1.0);
         self.gather(result, given.out, 1.0);
         pair_dots(self.level, pulls, result, grad, hd);
-        let first = self.op.plan.tiles[self.tile].rows.start;
+        let first = self.plan.tiles[self.tile].rows.start;
         for (r, lse) in lse.iter_mut().enumerate() {
             let h = self.head * group + r % group;
-            *lse = given.lse[(first + r / group) * self.op.layout.heads + h];
+            *lse = given.lse[(first + r / group) * self.layout.heads + h];
         }
         self.dots(p, q, |p| Some(&p.keys_t), self.data.k, rows);
         self.dots(ds, grad, |p| p.values_t.as_ref(), self.data.v, rows);
-        softmax_grad(self.level, p, ds, stride, self.width(), &scratch.seen, lse, pulls);
+        softmax_grad(self.level, p, ds, stride, self.width(), &buffers.seen, [lse, pulls]);
         self.sums(dq, ds, |p| p.keys.as_ref(), self.data.k, rows);
         dq.iter_mut().for_each(|d| *d *= scale);
         self.scatter(dk, base, ds, q, rows);
@@ -279,8 +267,8 @@ impl<'a> Work<'a> {
 
 /// What the backward pass starts from: output, its gradient, log-sum-exp.
 #[derive(Clone, Copy)]
-pub(in crate::kernels) struct Given<'a> {
-    pub(in crate::kernels) out: &'a [f32],
-    pub(in crate::kernels) grad: &'a [f32],
-    pub(in crate::kernels) lse: &'a [f32],
+pub(super) struct BackwardInputs<'a> {
+    pub(super) out: &'a [f32],
+    pub(super) grad: &'a [f32],
+    pub(super) lse: &'a [f32],
 }

@@ -1,4 +1,7 @@
 //! Matrix products of f32.
 
-pub(in crate::kernels) mod panels;
-pub(in crate::kernels) mod product;
+mod panels;
+mod product;
+
+pub(in crate::kernels) use panels::{Lhs, Panels};
+pub(in crate::kernels) use product::{Init, multiply};

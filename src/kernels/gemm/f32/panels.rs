@@ -15,10 +15,10 @@ pub(in crate::kernels) struct Panels<'a> {
 impl<'a> Panels<'a> {
     /// Fills each panel by `fill(panel, first column, columns)`.
     fn build(k: usize, n: usize, fill: impl Fn(&mut [f32], usize, usize) + Sync) -> Self {
-        let nr = width(n);
+        let nr = panel_width(n);
         let mut data = vec![0f32; n.div_ceil(nr) * nr * k];
         let fill = |(p, panel): (usize, &mut [f32])| fill(panel, p * nr, nr.min(n - p * nr));
-        if k > 0 && data.len() < SERIAL {
+        if k > 0 && data.len() < SERIAL_ELEMENTS {
             data.chunks_exact_mut(nr * k).enumerate().for_each(fill);
         } else if k > 0 {
             data.par_chunks_exact_mut(nr * k).enumerate().for_each(fill);
@@ -29,7 +29,7 @@ impl<'a> Panels<'a> {
     /// Packs `b`, whose rows of `n` start every `stride` elements. What is a panel already is not
     /// copied.
     pub(in crate::kernels) fn from_rows(b: &'a [f32], stride: usize, k: usize, n: usize) -> Self {
-        let nr = width(n);
+        let nr = panel_width(n);
         if n == nr && stride == n {
             return Panels { data: Cow::Borrowed(&b[..k * n]), k, n, nr };
         }
@@ -43,12 +43,11 @@ impl<'a> Panels<'a> {
 
     /// Packs the transpose of `b`, whose `n` rows of `k` start every `stride` elements.
     pub(in crate::kernels) fn from_columns(b: &[f32], stride: usize, k: usize, n: usize) -> Self {
-        let nr = width(n);
+        let nr = panel_width(n);
         Panels::build(k, n, |panel, first, cols| {
-            // In pieces whose rows stay in the first-level cache while the columns are written.
-            for (piece, rows) in panel.chunks_mut(nr * PIECE).enumerate() {
+            for (block, rows) in panel.chunks_mut(nr * BLOCK_ROWS).enumerate() {
                 for c in 0..cols {
-                    let from = (first + c) * stride + piece * PIECE;
+                    let from = (first + c) * stride + block * BLOCK_ROWS;
                     let column = &b[from..from + rows.len() / nr];
                     for (row, value) in rows.chunks_exact_mut(nr).zip(column) {
                         row[c] = *value;
@@ -63,25 +62,25 @@ impl<'a> Panels<'a> {
         Panels { data: Cow::Owned(self.data.into_owned()), k: self.k, n: self.n, nr: self.nr }
     }
 
-    pub(in crate::kernels) fn view(&self) -> View<'_> {
+    pub(in crate::kernels) fn view(&self) -> PanelsView<'_> {
         let Panels { data, k, n, nr } = self;
-        View { data, jump: k * nr, k: *k, n: *n, nr: *nr }
+        PanelsView { data, jump: k * nr, k: *k, n: *n, nr: *nr }
     }
 }
 
-/// Columns of a panel.
-fn width(n: usize) -> usize {
+/// Columns of each panel of a matrix with `n` columns.
+fn panel_width(n: usize) -> usize {
     if n <= 16 { 16 } else { 32 }
 }
 
-/// Below so many elements one thread packs.
-const SERIAL: usize = 1 << 17;
-/// Rows written together when packing a transpose.
-const PIECE: usize = 32;
+/// Elements below which one thread packs alone.
+const SERIAL_ELEMENTS: usize = 1 << 17;
+/// Rows written together when a transpose is packed: their panel stays in the first-level cache.
+const BLOCK_ROWS: usize = 32;
 
 /// Panels, or the first columns and rows of them.
 #[derive(Clone, Copy)]
-pub(in crate::kernels) struct View<'a> {
+pub(in crate::kernels) struct PanelsView<'a> {
     pub(in crate::kernels) data: &'a [f32],
     /// Elements from one panel to the next.
     pub(in crate::kernels) jump: usize,
@@ -90,20 +89,20 @@ pub(in crate::kernels) struct View<'a> {
     pub(in crate::kernels) nr: usize,
 }
 
-impl View<'_> {
+impl PanelsView<'_> {
     /// Only the first `n` columns.
     pub(in crate::kernels) fn columns(self, n: usize) -> Self {
-        View { n: n.min(self.n), ..self }
+        PanelsView { n: n.min(self.n), ..self }
     }
 
     /// Only the first `k` rows.
     pub(in crate::kernels) fn rows(self, k: usize) -> Self {
-        View { k: k.min(self.k), ..self }
+        PanelsView { k: k.min(self.k), ..self }
     }
 
     /// Without the first `rows` rows.
     pub(in crate::kernels) fn skip(self, rows: usize) -> Self {
-        View { data: &self.data[rows * self.nr..], k: self.k - rows, ..self }
+        PanelsView { data: &self.data[rows * self.nr..], k: self.k - rows, ..self }
     }
 }
 

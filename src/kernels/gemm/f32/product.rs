@@ -1,10 +1,11 @@
-//! The matrix product. One micro-kernel serves every product of this module: the left-hand side is
+//! The matrix product. One micro-kernel serves every product of f32: the left-hand side is
 //! read in place, along rows, along columns (a product with its transpose), or in several segments
 //! (the three image rows under a 3x3 filter), so it is never copied.
 
-use super::panels::{Lhs, View};
-use crate::kernels::isa::level::per_level;
-use crate::kernels::simd::vector::{Baseline, Vector};
+use super::panels::{Lhs, PanelsView};
+use crate::kernels::isa::per_level;
+use crate::kernels::simd::{Simd, Vector};
+use std::marker::PhantomData;
 
 /// What the product is added to.
 #[derive(Clone, Copy)]
@@ -18,16 +19,17 @@ pub(in crate::kernels) enum Init<'a> {
 
 per_level!(
     /// `dst = init + lhs * rhs`, where `dst` has `m` rows of `rhs.n` that start every `stride` elements.
-    fn multiply(dst: &mut [f32], stride: usize, m: usize, lhs: Lhs<'_>, rhs: View<'_>, init: Init<'_>) = multiply_body
+    fn multiply(dst: &mut [f32], stride: usize, m: usize, lhs: Lhs<'_>, rhs: PanelsView<'_>, init: Init<'_>) = multiply_body
 );
 
 #[inline(always)]
-fn multiply_body<const LANES: usize>(
+fn multiply_body<S: Simd>(
+    isa: S,
     dst: &mut [f32],
     stride: usize,
     m: usize,
     lhs: Lhs<'_>,
-    rhs: View<'_>,
+    rhs: PanelsView<'_>,
     init: Init<'_>,
 ) {
     if m == 0 || rhs.n == 0 {
@@ -38,7 +40,8 @@ fn multiply_body<const LANES: usize>(
     assert!((m - 1) * stride + rhs.n <= dst.len(), "destination too short");
     let panels = rhs.n.div_ceil(rhs.nr);
     assert!((panels - 1) * rhs.jump + rhs.k * rhs.nr <= rhs.data.len(), "panels too short");
-    let width = strip_width(LANES).min(rhs.nr);
+    let width = TileShape::<S::F32>::COLUMNS.min(rhs.nr);
+    assert!(rhs.nr.is_multiple_of(width), "panels of {} columns", rhs.nr);
     for p in 0..panels {
         let panel = &rhs.data[p * rhs.jump..p * rhs.jump + rhs.k * rhs.nr];
         for off in (0..rhs.nr).step_by(width) {
@@ -46,23 +49,29 @@ fn multiply_body<const LANES: usize>(
             if col < rhs.n {
                 let cols = width.min(rhs.n - col);
                 let strip = Strip { panel, nr: rhs.nr, off, col, cols };
-                strips::<LANES>(dst, stride, m, lhs, strip, init);
+                // SAFETY: the checks above: for `m` rows and `k` inner indices `lhs` is in bounds, the panel holds `k` rows
+                // of `nr`, and a strip's width divides `nr`.
+                unsafe { strip_of_tiles::<S::F32>(isa, dst, stride, m, lhs, strip, init) };
             }
         }
     }
 }
 
-/// Columns of a strip: two registers, four of NEON. (One of AVX-512 where panels have 16 columns.)
-const fn strip_width(lanes: usize) -> usize {
-    match lanes {
-        1 => 2 * Baseline::LANES,
-        4 => 4 * lanes,
-        _ => 2 * lanes,
-    }
+/// The shape of the register tile, which makes as many sums as the registers hold beside the operands.
+struct TileShape<V>(PhantomData<V>);
+
+impl<V: Vector> TileShape<V> {
+    /// 12 rows by 2 registers of columns; otherwise there are 6 rows.
+    const TALL: bool = V::REGISTERS == 32 && V::LANES > 4;
+    /// 6 rows by 4 registers: where registers are many and narrow, a step loads something for each row and each register of
+    /// columns, and 6 + 4 are fewer than 12 + 2.
+    const WIDE: bool = V::REGISTERS == 32 && V::LANES == 4;
+    /// Columns of a strip. (Where panels have 16 columns, one register of AVX-512.)
+    const COLUMNS: usize = if Self::WIDE { 4 * V::LANES } else { 2 * V::LANES };
 }
 
-/// Elements of the widest strip.
-const WIDEST: usize = 32;
+/// Columns of the widest strip.
+const MAX_STRIP_COLUMNS: usize = 32;
 
 #[derive(Clone, Copy)]
 struct Strip<'a> {
@@ -76,10 +85,13 @@ struct Strip<'a> {
     cols: usize,
 }
 
-/// One strip of columns. Heights and widths of the register tile: as many sums as the registers of
-/// each instruction set hold beside the operands.
+/// One strip of columns, by the tile of the register type.
+///
+/// # Safety
+/// As [`strip`], for the narrower of [`TileShape::COLUMNS`] and `b.nr` columns.
 #[inline(always)]
-fn strips<const LANES: usize>(
+unsafe fn strip_of_tiles<V: Vector>(
+    isa: V::Isa,
     dst: &mut [f32],
     stride: usize,
     m: usize,
@@ -87,32 +99,27 @@ fn strips<const LANES: usize>(
     b: Strip<'_>,
     init: Init<'_>,
 ) {
-    // SAFETY: `LANES` is above 1 only inside functions compiled for, and called on, such machines;
-    // `multiply_body` checked the operands' sizes.
+    // SAFETY: the caller's promise; each tile has as many columns as the strip.
     unsafe {
-        #[cfg(target_arch = "x86_64")]
-        match LANES {
-            16 if b.nr == 32 => {
-                return strip::<std::arch::x86_64::__m512, 12, 2>(dst, stride, m, lhs, b, init);
+        if TileShape::<V>::TALL {
+            match b.nr < TileShape::<V>::COLUMNS {
+                true => strip::<V, 12, 1>(isa, dst, stride, m, lhs, b, init),
+                false => strip::<V, 12, 2>(isa, dst, stride, m, lhs, b, init),
             }
-            16 => return strip::<std::arch::x86_64::__m512, 12, 1>(dst, stride, m, lhs, b, init),
-            8 => return strip::<std::arch::x86_64::__m256, 6, 2>(dst, stride, m, lhs, b, init),
-            _ => {}
+        } else if TileShape::<V>::WIDE {
+            strip::<V, 6, 4>(isa, dst, stride, m, lhs, b, init);
+        } else {
+            strip::<V, 6, 2>(isa, dst, stride, m, lhs, b, init);
         }
-        #[cfg(target_arch = "aarch64")]
-        if LANES == 4 {
-            // A step loads something for each row and each register of columns: 6 + 4 are fewer than 12 + 2.
-            return strip::<std::arch::aarch64::float32x4_t, 6, 4>(dst, stride, m, lhs, b, init);
-        }
-        strip::<Baseline, 6, 2>(dst, stride, m, lhs, b, init)
     }
 }
 
 /// # Safety
-/// The CPU must have `V`'s instructions; for `m` rows and every inner index `lhs` must be in bounds,
-/// `b.panel` must hold as many rows of `b.nr`, and `b.off` with the strip's width end within `b.nr`.
+/// For `m` rows and every inner index `lhs` must be in bounds, `b.panel` must hold as many rows of `b.nr`, and `b.off` plus
+/// `NV` registers must end within `b.nr`.
 #[inline(always)]
 unsafe fn strip<V: Vector, const MR: usize, const NV: usize>(
+    isa: V::Isa,
     dst: &mut [f32],
     stride: usize,
     m: usize,
@@ -121,18 +128,18 @@ unsafe fn strip<V: Vector, const MR: usize, const NV: usize>(
     init: Init<'_>,
 ) {
     let mut r = 0;
-    // SAFETY: the caller's promise; no tile passes row `m`.
+    // SAFETY: the caller's promise holds for all `m` rows, and no tile passes row `m`.
     unsafe {
         while r + MR <= m {
-            block::<V, MR, NV>(dst, stride, r, lhs, b, init);
+            block::<V, MR, NV>(isa, dst, stride, r, lhs, b, init);
             r += MR;
         }
         while r + 4 <= m {
-            block::<V, 4, NV>(dst, stride, r, lhs, b, init);
+            block::<V, 4, NV>(isa, dst, stride, r, lhs, b, init);
             r += 4;
         }
         while r < m {
-            block::<V, 1, NV>(dst, stride, r, lhs, b, init);
+            block::<V, 1, NV>(isa, dst, stride, r, lhs, b, init);
             r += 1;
         }
     }
@@ -142,6 +149,7 @@ unsafe fn strip<V: Vector, const MR: usize, const NV: usize>(
 /// As [`strip`], for `MR` rows from `row` on.
 #[inline(always)]
 unsafe fn block<V: Vector, const MR: usize, const NV: usize>(
+    isa: V::Isa,
     dst: &mut [f32],
     stride: usize,
     row: usize,
@@ -149,17 +157,18 @@ unsafe fn block<V: Vector, const MR: usize, const NV: usize>(
     b: Strip<'_>,
     init: Init<'_>,
 ) {
-    let mut start = [0f32; WIDEST];
+    assert!(NV * V::LANES <= MAX_STRIP_COLUMNS);
+    let mut start = [0f32; MAX_STRIP_COLUMNS];
     if let Init::Bias(bias) = init {
         start[..b.cols].copy_from_slice(&bias[b.col..b.col + b.cols]);
     }
-    // SAFETY: the caller's promise; `start` and `line` hold `NV` registers (at most `WIDEST`
-    // elements), and so does a destination row where `cols` says that all of them exist.
+    // SAFETY: the caller's promise for the operands; `start` and `line` hold `NV` registers, and so does a destination row
+    // where `cols` says that all of them exist.
     unsafe {
-        let from: [V; NV] = std::array::from_fn(|c| V::load(start.as_ptr().add(c * V::LANES)));
+        let from: [V; NV] = std::array::from_fn(|c| V::load(isa, start.as_ptr().add(c * V::LANES)));
         let acc = match lhs.transposed {
-            true => tile::<V, MR, NV, true>([from; MR], row, lhs, b),
-            false => tile::<V, MR, NV, false>([from; MR], row, lhs, b),
+            true => tile::<V, MR, NV, true>(isa, [from; MR], row, lhs, b),
+            false => tile::<V, MR, NV, false>(isa, [from; MR], row, lhs, b),
         };
         for (r, acc) in acc.iter().enumerate() {
             let to = (row + r) * stride + b.col;
@@ -167,14 +176,14 @@ unsafe fn block<V: Vector, const MR: usize, const NV: usize>(
             if b.cols == NV * V::LANES {
                 for (c, &acc) in acc.iter().enumerate() {
                     let at = out.as_mut_ptr().add(c * V::LANES);
-                    let old = if let Init::Add = init { V::load(at) } else { V::splat(0.0) };
-                    acc.madd(V::splat(1.0), old).store(at);
+                    let old = if let Init::Add = init { V::load(isa, at) } else { V::splat(isa, 0.0) };
+                    acc.madd(isa, V::splat(isa, 1.0), old).store(isa, at);
                 }
                 continue;
             }
-            let mut line = [0f32; WIDEST];
+            let mut line = [0f32; MAX_STRIP_COLUMNS];
             for (c, acc) in acc.iter().enumerate() {
-                acc.store(line.as_mut_ptr().add(c * V::LANES));
+                acc.store(isa, line.as_mut_ptr().add(c * V::LANES));
             }
             for (o, a) in out.iter_mut().zip(&line) {
                 *o = if let Init::Add = init { *o + a } else { *a };
@@ -189,24 +198,25 @@ unsafe fn block<V: Vector, const MR: usize, const NV: usize>(
 /// As [`strip`], for `MR` rows from `row` on.
 #[inline(always)]
 unsafe fn tile<V: Vector, const MR: usize, const NV: usize, const TRANSPOSED: bool>(
+    isa: V::Isa,
     mut acc: [[V; NV]; MR],
     row: usize,
     lhs: Lhs<'_>,
     b: Strip<'_>,
 ) -> [[V; NV]; MR] {
-    // SAFETY: the caller's promise.
+    // SAFETY: the caller's promise: every index below is one of these rows and inner indices.
     unsafe {
         let mut right = b.panel.as_ptr().add(b.off);
         let start = lhs.data.as_ptr().add(if TRANSPOSED { row } else { row * lhs.stride });
         for segment in 0..lhs.segments {
             let left = start.add(segment * lhs.jump);
             for i in 0..lhs.length {
-                let columns: [V; NV] = std::array::from_fn(|c| V::load(right.add(c * V::LANES)));
+                let columns: [V; NV] = std::array::from_fn(|c| V::load(isa, right.add(c * V::LANES)));
                 for (r, acc) in acc.iter_mut().enumerate() {
                     let at = if TRANSPOSED { i * lhs.stride + r } else { r * lhs.stride + i };
-                    let x = V::splat(*left.add(at));
+                    let x = V::splat(isa, *left.add(at));
                     for c in 0..NV {
-                        acc[c] = x.madd(columns[c], acc[c]);
+                        acc[c] = x.madd(isa, columns[c], acc[c]);
                     }
                 }
                 right = right.wrapping_add(b.nr);
@@ -218,9 +228,9 @@ unsafe fn tile<V: Vector, const MR: usize, const NV: usize, const TRANSPOSED: bo
 
 #[cfg(test)]
 mod tests {
-    use super::super::panels::Panels;
     use super::*;
-    use crate::kernels::isa::level::Level;
+    use crate::kernels::gemm::f32::Panels;
+    use crate::kernels::isa::Level;
     use crate::kernels::testing::{random, values};
 
     fn naive(a: &[f32], b: &[f32], m: usize, k: usize, n: usize) -> Vec<f64> {

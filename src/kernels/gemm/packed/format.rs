@@ -1,8 +1,7 @@
 //! How the matrices of a model are held.
 
-use super::isa;
 use crate::error::{Error, Result};
-use crate::kernels::isa::level::Level;
+use crate::kernels::isa::Level;
 use candle_core::Device;
 
 /// How the weights of a model are held in memory.
@@ -37,9 +36,9 @@ pub enum WeightFormat {
 
 impl WeightFormat {
     /// What this machine multiplies best without losing what a published checkpoint holds: bf16 on a CPU with
-    /// instructions for it (AVX512-BF16, AMX), f32 elsewhere. On 64-bit Arm it is f32 even with FEAT_BF16, whose speed was not measured.
+    /// instructions for it (AVX512-BF16), f32 elsewhere. On 64-bit Arm it is f32 even with FEAT_BF16, whose speed was not measured.
     pub fn native(device: &Device) -> Self {
-        if device.is_cpu() && cfg!(target_arch = "x86_64") && isa::multiplies_bf16(Level::current()) {
+        if device.is_cpu() && cfg!(target_arch = "x86_64") && Level::current().multiplies_bf16() {
             Self::Bf16
         } else {
             Self::F32
@@ -74,6 +73,7 @@ impl std::str::FromStr for WeightFormat {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::kernels::isa::forced;
 
     #[test]
     fn each_format_is_spelled_as_it_is_read() {
@@ -86,13 +86,11 @@ mod tests {
     #[test]
     fn a_machine_without_bf16_products_keeps_f32() {
         for level in Level::available() {
-            let forced =
-                crate::kernels::isa::level::forced::with(level, || WeightFormat::native(&Device::Cpu));
-            let bf16 = cfg!(target_arch = "x86_64") && isa::multiplies_bf16(level);
+            let forced = forced::with(level, || WeightFormat::native(&Device::Cpu));
+            let bf16 = cfg!(target_arch = "x86_64") && level.multiplies_bf16();
             let expected = if bf16 { WeightFormat::Bf16 } else { WeightFormat::F32 };
             assert_eq!(forced, expected, "{}", level.name());
         }
-        let portable = Level::available()[0];
-        assert!(!isa::multiplies_bf16(portable));
+        assert!(!Level::Portable.multiplies_bf16());
     }
 }

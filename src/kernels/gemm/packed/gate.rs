@@ -1,9 +1,12 @@
 //! The gated half of a SwiGLU network in one product.
 
-use super::gemm::Finish;
-use super::isa::Kernel;
-use super::panel::{HALF, WIDTH};
-use super::{PackedWeight, Rows, WeightFormat, expect_cpu_f32, rows};
+use super::format::WeightFormat;
+use super::kernel::GemmKernel;
+use super::panels::{HALF_PANEL, PANEL_WIDTH};
+use super::product::Finish;
+use super::row_major::RowMajor;
+use super::select;
+use super::weight::{PackedWeight, expect_cpu_f32, pack_channels};
 use crate::error::{Error, Result};
 use crate::kernels::exec::{dims2, expect_dims, read, tensor};
 use candle_core::Tensor;
@@ -25,8 +28,8 @@ impl PackedGate {
     /// [`Error::Argument`] where sizes, types or devices do not fit; as [`PackedWeight::new`].
     pub fn new(
         format: WeightFormat,
-        (gate, gate_bias): (Rows<'_>, Option<&Tensor>),
-        (up, up_bias): (Rows<'_>, Option<&Tensor>),
+        (gate, gate_bias): (RowMajor<'_>, Option<&Tensor>),
+        (up, up_bias): (RowMajor<'_>, Option<&Tensor>),
     ) -> Result<Self> {
         let (outputs, k) = gate.dims();
         if up.dims() != (outputs, k) {
@@ -37,10 +40,10 @@ impl PackedGate {
             (None, None) => None,
             (gate, up) => Some(alternate(&values(gate, outputs)?, &values(up, outputs)?)),
         };
-        let channels = outputs.div_ceil(HALF) * WIDTH;
-        let both = rows::pack(format, &[gate, up], (channels, k), |channel| {
-            let row = channel / WIDTH * HALF + channel % HALF;
-            (row < outputs).then_some((channel % WIDTH / HALF, row))
+        let channels = outputs.div_ceil(HALF_PANEL) * PANEL_WIDTH;
+        let both = pack_channels(format, &[gate, up], (channels, k), |channel| {
+            let row = channel / PANEL_WIDTH * HALF_PANEL + channel % HALF_PANEL;
+            (row < outputs).then_some((channel % PANEL_WIDTH / HALF_PANEL, row))
         })?;
         Ok(PackedGate { both, bias, outputs })
     }
@@ -57,7 +60,7 @@ impl PackedGate {
 
     /// The format of the values.
     pub fn format(&self) -> WeightFormat {
-        self.both.format
+        self.both.format()
     }
 
     /// `silu(x G^T + g) * (x U^T + u)`, where `silu(z) = z / (1 + e^-z)`: `x` is `[n, k]`, f32 on the CPU; gives `[n, m]`.
@@ -66,10 +69,10 @@ impl PackedGate {
     /// # Errors
     /// [`Error::Argument`] for another shape, type or device.
     pub fn apply(&self, x: &Tensor) -> Result<Tensor> {
-        self.apply_by(Kernel::current(self.both.format), x)
+        self.apply_by(&select::current(self.both.format()), x)
     }
 
-    pub(in crate::kernels) fn apply_by(&self, kernel: Kernel, x: &Tensor) -> Result<Tensor> {
+    fn apply_by(&self, kernel: &GemmKernel, x: &Tensor) -> Result<Tensor> {
         let (n, _) = dims2("x", x)?;
         expect_dims("x", x, &[n, self.both.panels.k])?;
         expect_cpu_f32("x", x)?;
@@ -78,6 +81,7 @@ impl PackedGate {
         Ok(tensor(parts.pop().unwrap_or_default(), (n, self.outputs))?)
     }
 
+    /// What is done to the sums of both.
     pub(in crate::kernels) fn finish(&self) -> Finish<'_> {
         Finish { gated: true, ..self.both.finish(self.bias.as_deref()) }
     }
@@ -93,18 +97,20 @@ fn values(bias: Option<&Tensor>, m: usize) -> Result<Vec<f32>> {
 
 /// Values of the channels in the order of the panels, zeros where there is none.
 fn alternate(gate: &[f32], up: &[f32]) -> Vec<f32> {
-    let mut both = vec![0.0; gate.len().div_ceil(HALF) * WIDTH];
-    for (both, (gate, up)) in both.chunks_exact_mut(WIDTH).zip(gate.chunks(HALF).zip(up.chunks(HALF))) {
+    let mut both = vec![0.0; gate.len().div_ceil(HALF_PANEL) * PANEL_WIDTH];
+    for (both, (gate, up)) in
+        both.chunks_exact_mut(PANEL_WIDTH).zip(gate.chunks(HALF_PANEL).zip(up.chunks(HALF_PANEL)))
+    {
         both[..gate.len()].copy_from_slice(gate);
-        both[HALF..HALF + up.len()].copy_from_slice(up);
+        both[HALF_PANEL..HALF_PANEL + up.len()].copy_from_slice(up);
     }
     both
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::tests::{SHAPES, every_kernel, packed_as};
     use super::*;
+    use crate::kernels::gemm::packed::tests::{SHAPES, every_kernel, packed_as};
     use crate::kernels::testing::{random, same_on_any_thread_count, values};
 
     #[test]
@@ -114,7 +120,7 @@ mod tests {
         {
             let x = random(&[n, k], 1);
             let [gate, up] = [2, 3].map(|seed| values(&random(&[m, k], seed)));
-            let [gate_rows, up_rows] = [&gate, &up].map(|w| Rows::f32(w, m, k).unwrap());
+            let [gate_rows, up_rows] = [&gate, &up].map(|w| RowMajor::f32(w, m, k).unwrap());
             let [gate, up] = [&gate, &up].map(|w| packed_as(format, w, m, k));
             let (gate_bias, up_bias) = (random(&[m], 4), random(&[m], 5));
             for (gate_bias, up_bias) in
@@ -123,9 +129,9 @@ mod tests {
                 let both = PackedGate::new(format, (gate_rows, gate_bias), (up_rows, up_bias)).unwrap();
                 assert_eq!((both.dims(), both.format()), ((m, k), format));
                 for kernel in every_kernel(format) {
-                    let found = values(&both.apply_by(kernel, &x).unwrap());
-                    let gates = values(&gate.linear_by(kernel, &x, gate_bias).unwrap());
-                    let ups = values(&up.linear_by(kernel, &x, up_bias).unwrap());
+                    let found = values(&both.apply_by(&kernel, &x).unwrap());
+                    let gates = values(&gate.linear_by(&kernel, &x, gate_bias).unwrap());
+                    let ups = values(&up.linear_by(&kernel, &x, up_bias).unwrap());
                     assert_eq!(found.len(), n * m);
                     for ((found, gate), up) in found.iter().zip(gates).zip(ups) {
                         let expected = f64::from(gate) / (1.0 + (-f64::from(gate)).exp()) * f64::from(up);
@@ -140,7 +146,7 @@ mod tests {
     #[test]
     fn threads_do_not_matter_and_misfits_are_errors() {
         let w = values(&random(&[301, 40], 2));
-        let rows = |m: usize| Rows::f32(&w[..m * 40], m, 40).unwrap();
+        let rows = |m: usize| RowMajor::f32(&w[..m * 40], m, 40).unwrap();
         let gate = |up, bias| PackedGate::new(WeightFormat::Bf16, (rows(300), None), (up, bias));
         let both = gate(rows(300), None).unwrap();
         let x = random(&[250, 40], 1);

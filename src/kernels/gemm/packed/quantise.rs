@@ -1,17 +1,21 @@
 //! Rounding rows of f32 to bytes, symmetric: `value = scale * byte`, byte in -127 ..= 127.
 
-/// Rows whose largest magnitude is below count as zeros, lest their scale be subnormal.
-const TINY: f32 = 1e-35;
+#[cfg(target_arch = "x86_64")]
+use crate::kernels::isa::Avx512;
+use crate::kernels::isa::Isa;
+
+/// Rows whose largest magnitude is below count as zeros, so that no scale is subnormal.
+const MIN_MAGNITUDE: f32 = 1e-35;
 /// 1.5 * 2^23: a small value added to it is rounded to an integer, ties to even, in the low bits.
-const ROUND: f32 = 12_582_912.0;
+const ROUNDING: f32 = 12_582_912.0;
 /// The largest byte.
-const LARGEST: f32 = 127.0;
+const MAX_BYTE: f32 = 127.0;
 /// What stands for zero in an unsigned byte.
-pub(in crate::kernels) const ZERO: i32 = 128;
+pub(super) const ZERO_POINT: i32 = 128;
 
 /// The scale of a row and what to multiply its values by; NaN if a value is not finite, zeros for a row of zeros.
 #[inline(always)]
-pub(in crate::kernels) fn scale(values: &[f32]) -> (f32, f32) {
+pub(super) fn scale(values: &[f32]) -> (f32, f32) {
     // Magnitudes order as their bits do, with infinity and NaN above all.
     let mut largest = [0u32; 16];
     let (chunks, rest) = values.as_chunks::<16>();
@@ -30,18 +34,18 @@ fn scale_of(largest: f32) -> (f32, f32) {
     if !largest.is_finite() {
         return (f32::NAN, 0.0);
     }
-    if largest < TINY { (0.0, 0.0) } else { (largest / LARGEST, LARGEST / largest) }
+    if largest < MIN_MAGNITUDE { (0.0, 0.0) } else { (largest / MAX_BYTE, MAX_BYTE / largest) }
 }
 
 /// `value * by` to the nearest integer.
 #[inline(always)]
 fn nearest(value: f32, by: f32) -> i32 {
     // What is not finite gives some integer: its row's scale is NaN.
-    (value * by + ROUND).to_bits().wrapping_sub(ROUND.to_bits()) as i32
+    (value * by + ROUNDING).to_bits().wrapping_sub(ROUNDING.to_bits()) as i32
 }
 
 /// A row of a weight as words of four signed bytes. Returns its scale and the sum of its bytes.
-pub(in crate::kernels) fn weight_row(values: &[f32], words: &mut [u32]) -> (f32, i32) {
+pub(super) fn weight_row(values: &[f32], words: &mut [u32]) -> (f32, i32) {
     let (scale, by) = scale(values);
     if scale.is_nan() {
         words.fill(0);
@@ -61,14 +65,14 @@ pub(in crate::kernels) fn weight_row(values: &[f32], words: &mut [u32]) -> (f32,
 }
 
 /// The four signed bytes of a word.
-pub(in crate::kernels) fn bytes(word: u32) -> [f32; 4] {
+pub(super) fn bytes(word: u32) -> [f32; 4] {
     word.to_le_bytes().map(|byte| f32::from(byte as i8))
 }
 
 /// A row of activations as words of four unsigned bytes, and its scale.
 #[cfg(any(test, target_arch = "x86_64"))]
 #[inline(always)]
-pub(in crate::kernels) fn unsigned_bytes(words: &mut [u32], values: &[f32]) -> f32 {
+pub(super) fn unsigned_bytes<S: Isa>(_: S, words: &mut [u32], values: &[f32]) -> f32 {
     let (scale, by) = scale(values);
     bytes_by(words, values, |value| unsigned(value, by));
     scale
@@ -77,7 +81,7 @@ pub(in crate::kernels) fn unsigned_bytes(words: &mut [u32], values: &[f32]) -> f
 /// The same with signed bytes.
 #[cfg(any(test, target_arch = "aarch64"))]
 #[inline(always)]
-pub(in crate::kernels) fn signed_bytes(words: &mut [u32], values: &[f32]) -> f32 {
+pub(super) fn signed_bytes<S: Isa>(_: S, words: &mut [u32], values: &[f32]) -> f32 {
     let (scale, by) = scale(values);
     bytes_by(words, values, |value| nearest(value, by) as u8);
     scale
@@ -105,16 +109,13 @@ fn bytes_by(words: &mut [u32], values: &[f32], to_byte: impl Fn(f32) -> u8) {
 }
 
 /// [`unsigned_bytes`] by AVX-512, the same bytes: its conversion to integers rounds to nearest even too.
-///
-/// # Safety
-/// The CPU must have AVX-512 (F and BW).
 #[cfg(target_arch = "x86_64")]
 #[inline(always)]
-pub(in crate::kernels) unsafe fn unsigned_bytes_at_once(words: &mut [u32], values: &[f32]) -> f32 {
+pub(super) fn unsigned_bytes_avx512<S: Into<Avx512>>(_: S, words: &mut [u32], values: &[f32]) -> f32 {
     use std::arch::x86_64::*;
     let (whole, rest) = values.as_chunks::<64>();
     let (first, last) = words.split_at_mut(whole.len() * 16);
-    // SAFETY: the caller's promise for the CPU; 64 values become 16 words, and less than 64 are read under a mask.
+    // SAFETY: the token proves that the CPU has the instructions; 64 values become 16 words, and fewer are read under a mask.
     unsafe {
         let magnitude = |from: *const f32, mask: __mmask16| {
             let bits = _mm512_maskz_loadu_epi32(mask, from.cast());
@@ -133,7 +134,7 @@ pub(in crate::kernels) unsafe fn unsigned_bytes_at_once(words: &mut [u32], value
         let [a, b, c, d] = largest;
         let largest = _mm512_max_epu32(_mm512_max_epu32(a, b), _mm512_max_epu32(c, d));
         let (scale, by) = scale_of(f32::from_bits(_mm512_reduce_max_epu32(largest)));
-        let (factor, zero) = (_mm512_set1_ps(by), _mm_set1_epi8(ZERO as u8 as i8));
+        let (factor, zero) = (_mm512_set1_ps(by), _mm_set1_epi8(ZERO_POINT as u8 as i8));
         for (words, values) in first.as_chunks_mut::<16>().0.iter_mut().zip(whole) {
             for i in 0..4 {
                 let values = _mm512_mul_ps(_mm512_loadu_ps(values.as_ptr().add(16 * i)), factor);
@@ -150,12 +151,12 @@ pub(in crate::kernels) unsafe fn unsigned_bytes_at_once(words: &mut [u32], value
 /// `value * by` to the nearest integer, 128 being zero.
 #[inline(always)]
 fn unsigned(value: f32, by: f32) -> u8 {
-    nearest(value, by).wrapping_add(ZERO) as u8
+    nearest(value, by).wrapping_add(ZERO_POINT) as u8
 }
 
 /// The same as 16-bit pairs, two words to a step: values 0 and 2, then 1 and 3.
 #[inline(always)]
-pub(in crate::kernels) fn unsigned_pairs(words: &mut [u32], values: &[f32]) -> f32 {
+pub(super) fn unsigned_pairs<S: Isa>(_: S, words: &mut [u32], values: &[f32]) -> f32 {
     let (scale, by) = scale(values);
     let byte = |value: f32| u32::from(unsigned(value, by));
     let (chunks, rest) = values.as_chunks::<4>();
@@ -176,6 +177,7 @@ pub(in crate::kernels) fn unsigned_pairs(words: &mut [u32], values: &[f32]) -> f
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::kernels::isa::Portable;
 
     #[test]
     fn the_largest_becomes_127_and_ties_go_to_even() {
@@ -192,15 +194,15 @@ mod tests {
             let steps = n.div_ceil(4);
             let (mut single, mut pairs) = (vec![0u32; steps], vec![0u32; 2 * steps]);
             let mut signed = vec![0u32; steps];
-            let scale = unsigned_bytes(&mut single, &values);
-            assert_eq!(scale, unsigned_pairs(&mut pairs, &values));
-            assert_eq!(scale, signed_bytes(&mut signed, &values));
+            let scale = unsigned_bytes(Portable, &mut single, &values);
+            assert_eq!(scale, unsigned_pairs(Portable, &mut pairs, &values));
+            assert_eq!(scale, signed_bytes(Portable, &mut signed, &values));
             for i in 0..4 * steps {
                 let byte = single[i / 4] >> (8 * (i % 4)) & 0xff;
                 assert_eq!(byte, pairs[i / 4 * 2 + i % 2] >> (8 * (i & 2)) & 0xff);
                 let value = if i < n { values[i] } else { continue };
-                assert_eq!(signed[i / 4].to_le_bytes()[i % 4] as i8 as i32, byte as i32 - ZERO);
-                assert!(((byte as i32 - ZERO) as f32 * scale - value).abs() <= 0.5001 * scale);
+                assert_eq!(signed[i / 4].to_le_bytes()[i % 4] as i8 as i32, byte as i32 - ZERO_POINT);
+                assert!(((byte as i32 - ZERO_POINT) as f32 * scale - value).abs() <= 0.5001 * scale);
             }
         }
     }
@@ -208,25 +210,21 @@ mod tests {
     #[cfg(target_arch = "x86_64")]
     #[test]
     fn avx512_gives_the_same_bytes() {
-        if !is_x86_feature_detected!("avx512bw") {
-            return;
-        }
+        let Some(isa) = Avx512::detect() else { return };
         for (n, times) in (0..70usize).chain([128, 200, 1000]).flat_map(|n| [1.0, 0.0, 1e-38].map(|t| (n, t)))
         {
             // Halves among them: ties.
             let values: Vec<f32> = (0..n).map(|i| times * ((i * 37 % 255) as f32 / 2.0 - 63.5)).collect();
             let (mut plain, mut fast) = (vec![7u32; n.div_ceil(4)], vec![9u32; n.div_ceil(4)]);
-            let scale = unsigned_bytes(&mut plain, &values);
-            // SAFETY: the CPU has AVX-512, as was seen above.
-            assert_eq!(scale.to_bits(), unsafe { unsigned_bytes_at_once(&mut fast, &values) }.to_bits());
+            let scale = unsigned_bytes(Portable, &mut plain, &values);
+            assert_eq!(scale.to_bits(), unsigned_bytes_avx512(isa, &mut fast, &values).to_bits());
             assert_eq!(plain, fast, "{n}");
         }
         for bad in [f32::NAN, f32::INFINITY] {
             let mut values = vec![1f32; 150];
             for at in [3, 140] {
                 values[at] = bad;
-                // SAFETY: as above.
-                assert!(unsafe { unsigned_bytes_at_once(&mut [0; 38], &values) }.is_nan());
+                assert!(unsigned_bytes_avx512(isa, &mut [0; 38], &values).is_nan());
                 values[at] = 1.0;
             }
         }

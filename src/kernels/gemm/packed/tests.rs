@@ -1,19 +1,24 @@
 //! One suite over every kernel that this machine can run.
 
-use super::isa::kernels;
+use super::format::WeightFormat;
+use super::kernel::GemmKernel;
+use super::panels::AlignedWords;
+use super::product::Product;
+use super::row_major::RowMajor;
+use super::weight::PackedWeight;
 use super::words::{bf16, halves};
-use super::*;
-use crate::kernels::isa::level::Level;
+use super::{amx, select};
+use crate::kernels::isa::Level;
 use crate::kernels::testing::{random, same_on_any_thread_count, values};
-use candle_core::Device;
+use candle_core::{DType, Device, Tensor};
 use std::mem::MaybeUninit;
 
-pub(in crate::kernels) fn every_kernel(format: WeightFormat) -> Vec<Kernel> {
-    let levels = Level::available().into_iter().map(|level| kernels(level, format));
+pub(in crate::kernels) fn every_kernel(format: WeightFormat) -> Vec<GemmKernel> {
+    let levels = Level::available().into_iter().map(|level| select::kernels(level, format));
     levels
         .flat_map(|(plain, extended)| [Some(plain), extended])
         .flatten()
-        .chain([Kernel::emulated_amx(format)])
+        .chain([amx::emulated_kernel(format)])
         .collect()
 }
 
@@ -26,7 +31,7 @@ pub(in crate::kernels) fn matrix(values: Vec<f32>, n: usize, k: usize) -> Tensor
 }
 
 pub(in crate::kernels) fn packed_as(format: WeightFormat, w: &[f32], m: usize, k: usize) -> PackedWeight {
-    PackedWeight::new(format, &[Rows::f32(w, m, k).unwrap()]).unwrap()
+    PackedWeight::new(format, &[RowMajor::f32(w, m, k).unwrap()]).unwrap()
 }
 
 /// Inner dimensions, outputs and rows about every edge: of a word, a register, a panel, a block of steps.
@@ -55,8 +60,8 @@ fn bf16_products_are_those_of_f64() {
         let packed = packed_as(WeightFormat::Bf16, &values(&w), m, k);
         assert_eq!((packed.dims(), packed.format()), ((m, k), WeightFormat::Bf16));
         for kernel in every_kernel(WeightFormat::Bf16) {
-            let plain = values(&packed.linear_by(kernel, &x, None).unwrap());
-            let found = values(&packed.linear_by(kernel, &x, Some(&bias)).unwrap());
+            let plain = values(&packed.linear_by(&kernel, &x, None).unwrap());
+            let found = values(&packed.linear_by(&kernel, &x, Some(&bias)).unwrap());
             assert_eq!(found.len(), n * m);
             for (i, found) in found.iter().enumerate() {
                 let (row, column) = (i / m, i % m);
@@ -79,9 +84,9 @@ fn a_row_does_not_depend_on_the_others() {
     let x = random(&[n, k], 1);
     let packed = packed_as(WeightFormat::Bf16, &values(&random(&[m, k], 2)), m, k);
     for kernel in every_kernel(WeightFormat::Bf16) {
-        let all = packed.linear_by(kernel, &x, None).unwrap();
+        let all = packed.linear_by(&kernel, &x, None).unwrap();
         for (from, count) in [(0, 1), (28, 1), (3, 2), (5, 4), (7, 13)] {
-            let some = packed.linear_by(kernel, &x.narrow(0, from, count).unwrap(), None).unwrap();
+            let some = packed.linear_by(&kernel, &x.narrow(0, from, count).unwrap(), None).unwrap();
             assert_eq!(values(&some), values(&all.narrow(0, from, count).unwrap()), "{}", kernel.name);
         }
     }
@@ -96,7 +101,7 @@ fn not_a_number_and_infinities_reach_their_row_only() {
     x[3 * k + 1] = f32::NEG_INFINITY;
     let packed = packed_as(WeightFormat::Bf16, &vec![0.5; m * k], m, k);
     for kernel in every_kernel(WeightFormat::Bf16) {
-        let out = packed.linear_by(kernel, &matrix(x.clone(), n, k), None).unwrap();
+        let out = packed.linear_by(&kernel, &matrix(x.clone(), n, k), None).unwrap();
         let expected = [4.5, f32::NAN, f32::INFINITY, f32::NEG_INFINITY, 4.5];
         for (row, expected) in out.to_vec2::<f32>().unwrap().iter().zip(expected) {
             assert!(row.iter().all(|v| *v == expected || v.is_nan() && expected.is_nan()), "{row:?}");
@@ -110,10 +115,10 @@ fn every_element_is_written() {
         let (x, w) = (values(&random(&[n, k], 1)), values(&random(&[m, k], 2)));
         let packed = packed_as(WeightFormat::Bf16, &w, m, k);
         for kernel in every_kernel(WeightFormat::Bf16) {
-            let left = Left::new(kernel, &x, n, k);
+            let left = kernel.convert(&x, n, k);
             let mut out = vec![MaybeUninit::new(f32::NAN); n * m];
-            let finish = packed.finish(None);
-            Job { kernel, left: &left, panels: &packed.panels, m, finish }.run(&mut [&mut out]);
+            let product = Product { left: &left, panels: &packed.panels, m, finish: packed.finish(None) };
+            kernel.multiply(&product, &mut [&mut out]);
             // SAFETY: every element was initialised above.
             let written = out.iter().all(|v| unsafe { v.assume_init() }.is_finite());
             assert!(written, "{} {n}x{k}x{m}", kernel.name);
@@ -132,14 +137,14 @@ fn parts_and_sums_are_those_of_the_outputs() {
             let every = every_kernel(format);
             // The last two are the fastest and the emulated one.
             for kernel in if n > 300 { &every[every.len() - 2..every.len() - 1] } else { &every[..] } {
-                assert_eq!(n > 300, n > lhs::rows_at_once(*kernel, k));
+                assert_eq!(n > 300, n > kernel.form.chunk_rows(k));
                 let case = format!("{} {format} {n}x{k}x{m}", kernel.name);
-                let all = packed.linear_by(*kernel, &x, Some(&bias)).unwrap();
-                let sum = packed.multiply(*kernel, &x, Some(&bias), Some(&residual), &[m]).unwrap();
+                let all = packed.linear_by(kernel, &x, Some(&bias)).unwrap();
+                let sum = packed.multiply(kernel, &x, Some(&bias), Some(&residual), &[m]).unwrap();
                 assert_eq!(values(&sum[0]), values(&(&residual + &all).unwrap()), "{case}");
                 // One part within a panel, one over its edge, the last left out.
                 let widths = [m / 5, m - m / 5 - m / 7];
-                let parts = packed.multiply(*kernel, &x, Some(&bias), None, &widths).unwrap();
+                let parts = packed.multiply(kernel, &x, Some(&bias), None, &widths).unwrap();
                 let first = all.narrow(1, 0, m - m / 7).unwrap();
                 assert_eq!(values(&Tensor::cat(&parts, 1).unwrap()), values(&first), "{case}");
             }
@@ -152,10 +157,10 @@ fn what_an_earlier_product_left_is_not_multiplied() {
     for k in [1, 3, 7, 31] {
         let packed = packed_as(WeightFormat::Bf16, &vec![1.0; 2 * k], 2, k);
         for kernel in every_kernel(WeightFormat::Bf16) {
-            let mut earlier = panel::Words::recycled(1 << 14);
+            let mut earlier = AlignedWords::recycled(1 << 14);
             earlier.get_mut().fill(u32::MAX); // NaN
             earlier.recycle();
-            let out = packed.linear_by(kernel, &matrix(vec![1.0; 3 * k], 3, k), None).unwrap();
+            let out = packed.linear_by(&kernel, &matrix(vec![1.0; 3 * k], 3, k), None).unwrap();
             assert_eq!(values(&out), vec![k as f32; 6], "{} {k}", kernel.name);
         }
     }
@@ -175,7 +180,7 @@ fn rows_come_back_as_they_went_in() {
         let bytes: Vec<u8> = weight.iter().flat_map(|v| half::bf16::from_f32(*v).to_le_bytes()).collect();
         // An odd address, as a memory map may give.
         let moved = [vec![0], bytes].concat();
-        let stored = Rows::bf16(&moved[1..], m, k).unwrap();
+        let stored = RowMajor::bf16(&moved[1..], m, k).unwrap();
         let packed = PackedWeight::new(WeightFormat::Bf16, &[stored]).unwrap();
         let ids: Vec<u32> = (0..m as u32).rev().chain([0]).collect();
         let rows = packed.rows(&ids).unwrap();

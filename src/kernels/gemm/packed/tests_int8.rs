@@ -1,8 +1,8 @@
 //! The int8 format over every kernel that this machine can run.
 
-use super::rows::LONGEST_INT8;
+use super::format::WeightFormat;
 use super::tests::{SHAPES, every_kernel, matrix, packed_as};
-use super::*;
+use super::weight::{MAX_INT8_INPUTS, PackedWeight};
 use crate::kernels::testing::{random, same_on_any_thread_count, values};
 
 fn packed(w: &[f32], m: usize, k: usize) -> PackedWeight {
@@ -38,7 +38,7 @@ fn products_are_exact_at_every_level() {
         assert_eq!((weight.dims(), weight.format()), ((m, k), WeightFormat::Int8));
         let expected = expected(&values(&x), &w, &values(&bias), [n, k, m]);
         for kernel in every_kernel(WeightFormat::Int8) {
-            let found = values(&weight.linear_by(kernel, &x, Some(&bias)).unwrap());
+            let found = values(&weight.linear_by(&kernel, &x, Some(&bias)).unwrap());
             assert!(found == expected, "{} {n}x{k}x{m}", kernel.name);
         }
     }
@@ -46,10 +46,10 @@ fn products_are_exact_at_every_level() {
 
 #[test]
 fn the_largest_sums_do_not_overflow() {
-    let k = LONGEST_INT8;
+    let k = MAX_INT8_INPUTS;
     let weight = packed(&vec![-1.0; 2 * k], 2, k);
     for kernel in every_kernel(WeightFormat::Int8) {
-        let out = weight.linear_by(kernel, &matrix(vec![1.0; k], 1, k), None).unwrap();
+        let out = weight.linear_by(&kernel, &matrix(vec![1.0; k], 1, k), None).unwrap();
         assert_eq!(values(&out), [-(k as f32); 2], "{}", kernel.name);
     }
 }
@@ -62,7 +62,7 @@ fn what_is_not_finite_spoils_its_row_only() {
     x[3 * k - 1] = f32::NAN;
     let weight = packed(&vec![0.5; m * k], m, k);
     for kernel in every_kernel(WeightFormat::Int8) {
-        let out = weight.linear_by(kernel, &matrix(x.clone(), n, k), None).unwrap();
+        let out = weight.linear_by(&kernel, &matrix(x.clone(), n, k), None).unwrap();
         for (i, row) in out.to_vec2::<f32>().unwrap().iter().enumerate() {
             assert!(row.iter().all(|v| if i % 3 == 0 { (v - 35.0).abs() < 1e-4 } else { v.is_nan() }));
         }

@@ -1,6 +1,6 @@
 //! The 32-bit words of packed values, and bf16, whose 16 bits are the upper half of an f32.
 
-use crate::kernels::isa::level::per_level;
+use crate::kernels::isa::{Isa, per_level};
 
 /// `value` rounded to the nearest bf16, ties to even. A NaN stays one; what is too large becomes infinite.
 #[inline(always)]
@@ -46,7 +46,7 @@ per_level!(
 );
 
 #[inline(always)]
-fn pair_neighbours_body<const LANES: usize>(values: &[f32], words: &mut [u32]) {
+fn pair_neighbours_body<S: Isa>(_: S, values: &[f32], words: &mut [u32]) {
     from_f32(values, words);
 }
 
@@ -56,7 +56,7 @@ per_level!(
 );
 
 #[inline(always)]
-fn pair_rows_body<const LANES: usize>(low: &[f32], high: &[f32], words: &mut [u32]) {
+fn pair_rows_body<S: Isa>(_: S, low: &[f32], high: &[f32], words: &mut [u32]) {
     for (word, (low, high)) in words.iter_mut().zip(low.iter().zip(high)) {
         *word = bf16(*low) | bf16(*high) << 16;
     }
