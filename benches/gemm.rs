@@ -8,7 +8,7 @@ use candle_core::{Device, Tensor};
 use clap::Parser;
 use cpu_time::ThreadTime;
 use sdim::WeightFormat;
-use sdim::internals::kernels::{PackedGate, PackedWeight, Rows};
+use sdim::internals::kernels::{PackedGate, PackedWeight, RowMajor};
 use std::time::Instant;
 
 #[derive(Parser)]
@@ -56,7 +56,7 @@ fn weight(format: &str, m: usize, k: usize) -> Result<Weight> {
         "int8" => WeightFormat::Int8,
         other => anyhow::bail!("format {other}; expected bf16 or int8"),
     };
-    let rows = Rows::f32(&all, m, k)?;
+    let rows = RowMajor::f32(&all, m, k)?;
     Ok(match gate {
         true => Weight::Gate(PackedGate::new(format, (rows, None), (rows, None))?),
         false => Weight::Plain(PackedWeight::new(format, &[rows])?),

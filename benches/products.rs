@@ -9,7 +9,7 @@ mod shapes;
 
 use candle_core::{Device, Tensor};
 use criterion::{BenchmarkId, Criterion, SamplingMode, Throughput, criterion_group, criterion_main};
-use sdim::internals::kernels::{PackedGate, Rows, swiglu};
+use sdim::internals::kernels::{PackedGate, RowMajor, swiglu};
 use sdim::internals::vlm::layers::matrix::Matrix;
 use sdim::internals::vlm::qwen2_5::config::VlmConfig;
 use sdim::{Result, WeightFormat};
@@ -46,7 +46,7 @@ impl Weight {
     fn new((k, m, gated): Shape, format: WeightFormat) -> Result<Self> {
         if gated && format != WeightFormat::F32 {
             let values = shapes::random("weight", &[m, k]);
-            let rows = Rows::f32(&values, m, k)?;
+            let rows = RowMajor::f32(&values, m, k)?;
             return Ok(Self::Gate(PackedGate::new(format, (rows, None), (rows, None))?));
         }
         let one = Matrix::from_tensor(&values("weight", m, k), format)?;

@@ -83,6 +83,7 @@
 
 #![cfg_attr(docsrs, feature(doc_cfg))]
 #![deny(missing_docs)]
+#![deny(unsafe_code)]
 #![deny(unsafe_op_in_unsafe_fn)]
 #![warn(clippy::all)]
 
@@ -98,6 +99,7 @@ mod fusion;
 #[cfg(feature = "hub")]
 pub mod hub;
 mod image;
+#[allow(unsafe_code)]
 mod kernels;
 pub mod metrics;
 mod model;

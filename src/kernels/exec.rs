@@ -62,26 +62,6 @@ pub(super) fn tensor(data: Vec<f32>, shape: impl Into<Shape>) -> candle_core::Re
     Tensor::from_vec(data, shape.into(), &Device::Cpu)
 }
 
-/// A buffer of `len` elements that `fill` writes: what would be zeroed only to be overwritten is a pass over memory.
-///
-/// # Safety
-/// `fill` must write every element, and read none before. (Tests hand it NaN.)
-pub(super) unsafe fn written(len: usize, fill: impl FnOnce(&mut [f32])) -> Vec<f32> {
-    if cfg!(test) {
-        let mut data = vec![f32::NAN; len];
-        fill(&mut data);
-        return data;
-    }
-    let mut data = Vec::with_capacity(len);
-    // SAFETY: the memory is there and nobody else's; no element is read before the caller's `fill` has written it, and
-    // all are when it returns.
-    unsafe {
-        fill(std::slice::from_raw_parts_mut(data.as_mut_ptr(), len));
-        data.set_len(len);
-    }
-    data
-}
-
 /// Rows in a chunk of work, so that a chunk holds about `elements` elements. Depends on the shape
 /// only, never on the number of threads.
 pub(super) fn chunk_rows(width: usize, elements: usize) -> usize {

@@ -10,15 +10,8 @@
 pub fn keep_freed_memory() -> bool {
     #[cfg(all(target_os = "linux", target_env = "gnu"))]
     {
-        // The numbers of <malloc.h>.
-        const M_TRIM_THRESHOLD: i32 = -1;
-        const M_TOP_PAD: i32 = -2;
-        const M_MMAP_MAX: i32 = -4;
-        const M_ARENA_MAX: i32 = -8;
-        unsafe extern "C" {
-            fn mallopt(param: i32, value: i32) -> i32;
-        }
-        // SAFETY: `mallopt` takes two ints, may be called at any time, and is in every glibc.
+        use libc::{M_ARENA_MAX, M_MMAP_MAX, M_TOP_PAD, M_TRIM_THRESHOLD, mallopt};
+        // SAFETY: `mallopt` takes two ints and may be called at any time.
         unsafe {
             // One arena: those of other threads hold no more than 64 MB, and are given back.
             mallopt(M_ARENA_MAX, 1) == 1

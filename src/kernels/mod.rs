@@ -6,59 +6,37 @@
 //! composed from candle operations.
 //!
 //! The environment variable `SDIM_KERNEL` forces one instruction set, if the machine has it: `portable`; `avx2`, `avx512` or
-//! `amx` on x86-64; `neon` on 64-bit Arm. It is read once, at the first call. (AMX multiplies packed weights only; with
-//! it, everything else uses AVX-512. The dot products of AVX-512, AVX2 and NEON, of bf16 and of bytes, are used at these levels where
-//! the machine has them.)
+//! `amx` on x86-64; `neon` on 64-bit Arm. It is read once, at the first call. The dot products of AVX-512, AVX2 and NEON, of bf16 and of
+//! bytes, are used at these levels where the machine has them. AMX multiplies packed weights only, with AVX-512 for everything else, and
+//! is never chosen where it is not asked for: it has not run on hardware yet.
+//!
+//! From the bottom up: `isa` finds the instruction sets and compiles functions for them, `simd` has their registers; `gemm` multiplies
+//! matrices; `attention` and `ops` are what layers call. `exec` and `written` reach tensors' data and make results.
 //!
 //! This module knows nothing of images or depth, and is the only home of `unsafe` in the crate.
 
-mod activation;
-mod adamw;
-mod add;
 mod attention;
-mod attention_bf16;
-mod attention_composed;
-mod attention_cpu;
-mod attention_plan;
-mod attention_rows;
-mod attention_shared;
-#[cfg(test)]
-mod attention_tests;
-mod attention_tile;
-mod bins;
-mod conv;
 mod exec;
-mod level;
-mod linear;
-mod math;
+mod gemm;
+mod isa;
 mod memory;
-mod norm;
-mod packed;
-mod panels;
+mod ops;
 mod peak;
-mod product;
-mod rope;
-mod scale_shift;
+mod simd;
 #[cfg(test)]
 mod testing;
 mod threads;
-mod vector;
+mod written;
 
-pub use activation::{gelu_erf, swiglu};
-pub use adamw::adamw_step;
-pub use add::add;
-pub use attention::{AttentionLayout, Block, Precision, attention};
-pub use attention_shared::SharedKeys;
-pub use bins::{BinStats, bin_stats};
-pub use conv::conv3x3;
+pub use attention::{AttentionLayout, Block, Precision, SharedKeys, attention};
 pub(crate) use exec::read;
-pub use linear::linear;
+pub use gemm::packed::{PackedGate, PackedWeight, RowMajor, WeightFormat};
 pub use memory::keep_freed_memory;
-pub use norm::rms_norm;
-pub use packed::{PackedGate, PackedWeight, Rows, WeightFormat};
+pub use ops::{
+    AdamWStep, BinStats, adamw_step, add, affine_act, batch_norm_act, bin_stats, conv3x3, gelu_erf, linear,
+    packed_mlp, rms_norm, rope, swiglu,
+};
 pub use peak::peak_gflops;
-pub use rope::rope;
-pub use scale_shift::{affine_act, batch_norm_act};
 pub(crate) use threads::in_pool;
 #[cfg(feature = "train")]
 pub(crate) use threads::join;

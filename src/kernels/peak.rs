@@ -1,13 +1,14 @@
 //! What the multipliers of this machine can do when nothing has to come from memory.
 
-use super::level::Level;
-use super::packed::WeightFormat;
-use super::vector::{Baseline, Vector};
+use super::gemm::packed::WeightFormat;
+use super::isa::{Level, Portable, call_compiled};
+use super::simd::{Simd, Vector};
 use rayon::prelude::*;
 use std::time::Instant;
 
 /// Independent sums: enough to hide the latency of two multipliers.
 const SUMS: usize = 16;
+/// Products added to each sum.
 const STEPS: usize = 1 << 21;
 
 /// Operations per second of all threads, in 10^9, in a loop that adds products in registers alone: the ceiling that a
@@ -26,150 +27,160 @@ pub fn peak_gflops(format: WeightFormat) -> f64 {
 
 /// Runs the loop of the fastest instruction for a format; gives the number of operations.
 fn once(format: WeightFormat) -> usize {
-    let level = Level::current();
-    #[cfg(target_arch = "x86_64")]
-    {
-        use std::arch::x86_64::{__m256, __m512};
-        if level.is_amx() && format != WeightFormat::F32 {
-            // SAFETY: a `Level` says AMX only where the unit was found and checked.
-            return unsafe { super::packed::amx_busy(format, STEPS / 16) };
-        }
-        if level.is_avx512() {
-            // SAFETY: a `Level` says AVX-512 only where the CPU reported it; the extensions are asked for here.
-            return unsafe {
-                match format {
-                    WeightFormat::Bf16 if is_x86_feature_detected!("avx512bf16") => x86::bf16(),
-                    WeightFormat::Int8 if is_x86_feature_detected!("avx512vnni") => x86::int8(),
-                    _ => x86::avx512::<__m512>(),
-                }
-            };
-        }
-        if level.is_avx2() {
-            // SAFETY: a `Level` says AVX2 only where the CPU reported AVX2 and FMA.
-            return unsafe { x86::avx2::<__m256>() };
-        }
+    match Level::current() {
+        Level::Portable => f32_products(Portable),
+        #[cfg(target_arch = "x86_64")]
+        Level::Avx2(isa) => call_compiled!(Avx2, isa, f32_products, () -> usize),
+        #[cfg(target_arch = "x86_64")]
+        Level::Avx512(isa) => x86_64::avx512(isa, format),
+        #[cfg(target_arch = "x86_64")]
+        Level::Amx(isa) => x86_64::amx(isa, format),
+        #[cfg(target_arch = "aarch64")]
+        Level::Neon(isa) => aarch64::neon(isa, format),
     }
-    #[cfg(target_arch = "aarch64")]
-    if level.is_neon() {
-        use std::arch::is_aarch64_feature_detected;
-        // SAFETY: NEON is part of what this architecture's code is compiled for; the extensions are asked for here.
-        return unsafe {
-            match format {
-                WeightFormat::Bf16 if is_aarch64_feature_detected!("bf16") => neon::bf16(),
-                WeightFormat::Int8 if is_aarch64_feature_detected!("dotprod") => neon::int8(),
-                _ => floats::<std::arch::aarch64::float32x4_t>(),
-            }
-        };
-    }
-    let _ = (level, format);
-    // SAFETY: portable code, or a register that every machine of this architecture has.
-    unsafe { floats::<Baseline>() }
 }
 
-/// # Safety
-/// The CPU has the instruction set of `V`.
+/// The loop in f32.
 #[inline(always)]
-unsafe fn floats<V: Vector>() -> usize {
-    // SAFETY: the caller's promise; the buffer is larger than any register.
-    unsafe {
-        let mut sums = [V::splat(0.0); SUMS];
-        let (a, b) = (V::splat(std::hint::black_box(0.5)), V::splat(std::hint::black_box(0.25)));
-        for _ in 0..STEPS {
-            for sum in &mut sums {
-                *sum = a.madd(b, *sum);
-            }
-        }
-        for sum in sums {
-            let mut out = [0f32; 16];
-            sum.store(out.as_mut_ptr());
-            std::hint::black_box(out);
+fn f32_products<S: Simd>(isa: S) -> usize {
+    let mut sums = [S::F32::splat(isa, 0.0); SUMS];
+    let [a, b] = [0.5, 0.25].map(|x| S::F32::splat(isa, std::hint::black_box(x)));
+    for _ in 0..STEPS {
+        for sum in &mut sums {
+            *sum = a.madd(isa, b, *sum);
         }
     }
-    2 * V::LANES * SUMS * STEPS
+    for sum in sums {
+        let mut out = [0f32; 16];
+        assert!(S::F32::LANES <= out.len());
+        // SAFETY: the buffer holds a register.
+        unsafe { sum.store(isa, out.as_mut_ptr()) };
+        std::hint::black_box(out);
+    }
+    2 * S::F32::LANES * SUMS * STEPS
 }
 
 #[cfg(target_arch = "aarch64")]
-mod neon {
-    use super::{STEPS, SUMS};
-    use crate::kernels::packed::neon::{bfdot, sdot};
+mod aarch64 {
+    use super::{STEPS, SUMS, WeightFormat, f32_products};
+    use crate::kernels::gemm::packed::{bfdot, sdot};
+    use crate::kernels::isa::{Neon, NeonBf16, NeonDotProd, call_compiled};
     use std::arch::aarch64::*;
 
-    #[target_feature(enable = "neon,bf16")]
-    pub(super) fn bf16() -> usize {
-        let mut sums = [vdupq_n_f32(0.0); SUMS];
-        let halves = vdupq_n_u32(std::hint::black_box(0x3f00_3f00));
-        for _ in 0..STEPS {
-            for sum in &mut sums {
-                *sum = bfdot::<0>(*sum, halves, halves);
+    pub(super) fn neon(isa: Neon, format: WeightFormat) -> usize {
+        match (format, NeonBf16::detect(), NeonDotProd::detect()) {
+            (WeightFormat::Bf16, Some(isa), _) => call_compiled!(NeonBf16, isa, bf16_products, () -> usize),
+            (WeightFormat::Int8, _, Some(isa)) => {
+                call_compiled!(NeonDotProd, isa, int8_products, () -> usize)
             }
+            _ => call_compiled!(Neon, isa, f32_products, () -> usize),
         }
-        std::hint::black_box(sums);
+    }
+
+    #[inline(always)]
+    fn bf16_products(isa: NeonBf16) -> usize {
+        // SAFETY: the token proves that the CPU has the instructions.
+        unsafe {
+            let mut sums = [vdupq_n_f32(0.0); SUMS];
+            let halves = vdupq_n_u32(std::hint::black_box(0x3f00_3f00));
+            for _ in 0..STEPS {
+                for sum in &mut sums {
+                    *sum = bfdot::<0>(isa, *sum, halves, halves);
+                }
+            }
+            std::hint::black_box(sums);
+        }
         2 * 8 * SUMS * STEPS
     }
 
-    #[target_feature(enable = "neon,dotprod")]
-    pub(super) fn int8() -> usize {
-        let mut sums = [vdupq_n_s32(0); SUMS];
-        let threes = vdupq_n_u32(std::hint::black_box(0x0303_0303));
-        for _ in 0..STEPS {
-            for sum in &mut sums {
-                *sum = sdot::<0>(*sum, threes, threes);
+    #[inline(always)]
+    fn int8_products(isa: NeonDotProd) -> usize {
+        // SAFETY: the token proves that the CPU has the instructions.
+        unsafe {
+            let mut sums = [vdupq_n_s32(0); SUMS];
+            let threes = vdupq_n_u32(std::hint::black_box(0x0303_0303));
+            for _ in 0..STEPS {
+                for sum in &mut sums {
+                    *sum = sdot::<0>(isa, *sum, threes, threes);
+                }
             }
+            std::hint::black_box(sums);
         }
-        std::hint::black_box(sums);
         2 * 16 * SUMS * STEPS
     }
 }
 
 #[cfg(target_arch = "x86_64")]
-mod x86 {
-    use super::{STEPS, SUMS, Vector, floats};
+mod x86_64 {
+    use super::{STEPS, SUMS, WeightFormat, f32_products};
+    use crate::kernels::isa::{
+        Amx, AmxUnit, Avx512, Avx512Bf16, Avx512Vnni, TILE_SIDE, TileUnit, call_compiled,
+    };
     use std::arch::x86_64::*;
 
-    /// # Safety
-    /// The CPU has AVX-512F.
-    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw,avx2,fma")]
-    pub(super) unsafe fn avx512<V: Vector>() -> usize {
-        // SAFETY: the caller's promise.
-        unsafe { floats::<V>() }
-    }
-
-    /// # Safety
-    /// The CPU has AVX2 and FMA.
-    #[target_feature(enable = "avx2,fma")]
-    pub(super) unsafe fn avx2<V: Vector>() -> usize {
-        // SAFETY: the caller's promise.
-        unsafe { floats::<V>() }
-    }
-
-    /// # Safety
-    /// The CPU has AVX512-BF16.
-    #[target_feature(enable = "avx512f,avx512bf16")]
-    pub(super) unsafe fn bf16() -> usize {
-        let mut sums = [_mm512_setzero_ps(); SUMS];
-        let half = _mm512_set1_ps(std::hint::black_box(0.5));
-        let a = _mm512_cvtne2ps_pbh(half, half);
-        for _ in 0..STEPS {
-            for sum in &mut sums {
-                *sum = _mm512_dpbf16_ps(*sum, a, a);
-            }
+    pub(super) fn avx512(isa: Avx512, format: WeightFormat) -> usize {
+        match (format, Avx512Bf16::detect(), Avx512Vnni::detect()) {
+            (WeightFormat::Bf16, Some(isa), _) => call_compiled!(Avx512Bf16, isa, bf16_products, () -> usize),
+            (WeightFormat::Int8, _, Some(isa)) => call_compiled!(Avx512Vnni, isa, int8_products, () -> usize),
+            _ => call_compiled!(Avx512, isa, f32_products, () -> usize),
         }
-        std::hint::black_box(sums);
+    }
+
+    #[inline(always)]
+    fn bf16_products(_: Avx512Bf16) -> usize {
+        // SAFETY: the token proves that the CPU has the instructions.
+        unsafe {
+            let mut sums = [_mm512_setzero_ps(); SUMS];
+            let half = _mm512_set1_ps(std::hint::black_box(0.5));
+            let a = _mm512_cvtne2ps_pbh(half, half);
+            for _ in 0..STEPS {
+                for sum in &mut sums {
+                    *sum = _mm512_dpbf16_ps(*sum, a, a);
+                }
+            }
+            std::hint::black_box(sums);
+        }
         2 * 32 * SUMS * STEPS
     }
 
-    /// # Safety
-    /// The CPU has AVX512-VNNI.
-    #[target_feature(enable = "avx512f,avx512vnni")]
-    pub(super) unsafe fn int8() -> usize {
-        let mut sums = [_mm512_setzero_si512(); SUMS];
-        let a = _mm512_set1_epi8(std::hint::black_box(3));
-        for _ in 0..STEPS {
-            for sum in &mut sums {
-                *sum = _mm512_dpbusd_epi32(*sum, a, a);
+    #[inline(always)]
+    fn int8_products(_: Avx512Vnni) -> usize {
+        // SAFETY: the token proves that the CPU has the instructions.
+        unsafe {
+            let mut sums = [_mm512_setzero_si512(); SUMS];
+            let a = _mm512_set1_epi8(std::hint::black_box(3));
+            for _ in 0..STEPS {
+                for sum in &mut sums {
+                    *sum = _mm512_dpbusd_epi32(*sum, a, a);
+                }
+            }
+            std::hint::black_box(sums);
+        }
+        2 * 64 * SUMS * STEPS
+    }
+
+    /// Multiplies tiles that stay where they are, in turn, so that no product waits for another.
+    pub(super) fn amx(isa: Amx, format: WeightFormat) -> usize {
+        let rounds = STEPS / 16;
+        let per_word = match format {
+            WeightFormat::F32 => return call_compiled!(Avx512, isa.into(), f32_products, () -> usize),
+            WeightFormat::Bf16 => 2,
+            WeightFormat::Int8 => 4,
+        };
+        let mut unit = AmxUnit::start(isa);
+        for _ in 0..rounds {
+            if format == WeightFormat::Int8 {
+                unit.add_int8::<0, 4, 6>();
+                unit.add_int8::<1, 4, 7>();
+                unit.add_int8::<2, 5, 6>();
+                unit.add_int8::<3, 5, 7>();
+            } else {
+                unit.add_bf16::<0, 4, 6>();
+                unit.add_bf16::<1, 4, 7>();
+                unit.add_bf16::<2, 5, 6>();
+                unit.add_bf16::<3, 5, 7>();
             }
         }
-        std::hint::black_box(sums);
-        2 * 64 * SUMS * STEPS
+        rounds * 4 * 2 * TILE_SIDE * TILE_SIDE * TILE_SIDE * per_word
     }
 }

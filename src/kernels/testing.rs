@@ -1,7 +1,7 @@
 //! Helpers of the kernels' tests.
 
-use super::level::{Level, forced};
 use crate::error::Result;
+use crate::kernels::isa::{Level, forced};
 use candle_core::{Device, Tensor, Var};
 use rand::{Rng, SeedableRng};
 

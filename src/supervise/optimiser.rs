@@ -1,7 +1,7 @@
 //! AdamW with a moving average of the weights.
 
 use crate::error::{Error, Result};
-use crate::kernels;
+use crate::kernels::{self, AdamWStep};
 use candle_core::backprop::GradStore;
 use candle_core::{Device, Tensor, Var};
 use std::collections::BTreeMap;
@@ -123,19 +123,17 @@ impl Parameters {
         for (parameter, grad) in self.all.values_mut().zip(gradients.each) {
             let Some(grad) = grad else { continue };
             let decay = if parameter.decays { config.weight_decay } else { 0.0 };
-            kernels::adamw_step(
-                &mut parameter.values,
-                &grad,
-                &mut parameter.m,
-                &mut parameter.v,
-                rate,
-                config.beta1,
-                config.beta2,
-                config.eps,
-                decay,
+            let settings = AdamWStep {
+                lr: rate,
+                beta1: config.beta1,
+                beta2: config.beta2,
+                eps: config.eps,
+                weight_decay: decay,
                 step,
-                scale,
-            )?;
+                grad_scale: scale,
+            };
+            let Parameter { values, m, v, .. } = &mut *parameter;
+            kernels::adamw_step(values, &grad, m, v, &settings)?;
             parameter.sync()?;
         }
         Ok(())

@@ -2,7 +2,7 @@
 
 use super::stored::{Bytes, Stored};
 use crate::error::Result;
-use crate::kernels::{PackedWeight, Rows, WeightFormat};
+use crate::kernels::{PackedWeight, RowMajor, WeightFormat};
 use candle_core::{DType, Device, Tensor};
 
 /// A matrix `[out, in]` as it is found.
@@ -56,10 +56,10 @@ impl Raw<'_> {
 
 impl Held<'_> {
     /// What can be packed.
-    pub(crate) fn rows(&self) -> Result<Rows<'_>> {
+    pub(crate) fn rows(&self) -> Result<RowMajor<'_>> {
         match self {
-            Held::Bytes(bytes, [rows, columns]) => Rows::bf16(bytes, *rows, *columns),
-            Held::Values(values, [rows, columns]) => Rows::f32(values, *rows, *columns),
+            Held::Bytes(bytes, [rows, columns]) => RowMajor::bf16(bytes, *rows, *columns),
+            Held::Values(values, [rows, columns]) => RowMajor::f32(values, *rows, *columns),
         }
     }
 }

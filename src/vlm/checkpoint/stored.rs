@@ -50,7 +50,8 @@ impl std::ops::Deref for Bytes<'_> {
 }
 
 impl Inner {
-    /// All bytes of the file, or a range of them.
+    /// All bytes of the file, or a range of them. The only unsafe call outside of the kernels.
+    #[allow(unsafe_code)]
     fn bytes(&self, range: Option<Range<usize>>) -> Result<Bytes<'_>> {
         let file = match &self.content {
             Content::Bytes(bytes) => return Ok(Bytes::Held(range.map_or(&bytes[..], |r| &bytes[r]))),

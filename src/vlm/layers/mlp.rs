@@ -44,7 +44,7 @@ impl GatedMlp {
     pub fn forward_onto(&self, x: &Tensor, residual: &Tensor) -> Result<Tensor> {
         let gated = match (&self.inputs, &self.down) {
             (GateUp::Joined(both), Linear { weight: Matrix::Packed(down), bias, lora: None }) => {
-                return both.apply_onto(x, down, bias.as_ref(), residual);
+                return kernels::packed_mlp(both, x, down, bias.as_ref(), residual);
             }
             (GateUp::Joined(both), _) => both.apply(x)?,
             (GateUp::Apart { gate, up }, _) => kernels::swiglu(&gate.forward(x)?, &up.forward(x)?)?,

@@ -1,0 +1,7 @@
+//! Attention in f32, with gradients.
+
+mod op;
+mod softmax;
+mod tile;
+
+pub(super) use op::F32Attention;
