@@ -1,15 +1,21 @@
 //! A fresh small checkpoint: its configuration, its vocabulary and its initial weights.
 
+use super::shape::Shape;
+use crate::adapter::SETTINGS;
 use crate::error::{Error, Result};
-use crate::model::CheckpointFiles;
+use crate::files::{write_tensors, write_whole};
+use crate::model::{CheckpointFiles, SdimModel};
 use crate::query::Settings;
-use crate::query::number::{NumberFormat, bin_token};
+use crate::query::number::{NumberFormat, Numbers, bin_token};
+use crate::vlm::checkpoint::{CONFIG, PREPROCESSOR, TOKENIZER};
+use crate::vlm::weights::Weights;
 use candle_core::{Device, Tensor};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
+use std::path::Path;
 
 /// Special tokens of the small vocabulary, after the 256 bytes.
 const SPECIAL: [&str; 9] = [
@@ -23,6 +29,14 @@ const SPECIAL: [&str; 9] = [
     "<|video_pad|>",
     "<|point|>",
 ];
+
+/// Tokens of the vocabulary before the number tokens.
+pub(super) const WORDS: usize = 256 + SPECIAL.len();
+
+/// Id of a special token.
+pub(super) fn special_id(token: &str) -> usize {
+    256 + SPECIAL.iter().position(|s| *s == token).unwrap_or_default()
+}
 
 /// The JSON files of a checkpoint, as text.
 #[derive(Debug, Clone, PartialEq)]
@@ -38,76 +52,77 @@ pub struct FreshFiles {
 }
 
 impl FreshFiles {
-    /// The tiny model: about 3 million parameters, images of at most 49,152 pixels (256x192).
+    /// The tiny model.
     ///
     /// # Errors
-    /// [`Error::Format`] if a part cannot be written as JSON.
+    /// As [`FreshFiles::of`].
     pub fn tiny(settings: &Settings) -> Result<Self> {
+        Self::of(&Shape::tiny(), settings)
+    }
+
+    /// A model of any shape.
+    ///
+    /// # Errors
+    /// [`Error::Config`] names the key whose size does not fit; [`Error::Format`] if a part cannot be written as JSON.
+    pub fn of(shape: &Shape, settings: &Settings) -> Result<Self> {
         let numbers = match settings.number {
             NumberFormat::Bins { bins, .. } => bins,
             NumberFormat::Digits { .. } => 0,
         };
-        let vocab = (256 + SPECIAL.len() + numbers).next_multiple_of(16);
-        let id = |token: &str| 256 + SPECIAL.iter().position(|s| *s == token).unwrap_or_default();
-        let config = json!({
-            "architectures": ["Qwen2_5_VLForConditionalGeneration"],
-            "model_type": "qwen2_5_vl",
-            "bos_token_id": id("<|endoftext|>"),
-            "eos_token_id": id("<|im_end|>"),
-            "vision_start_token_id": id("<|vision_start|>"),
-            "vision_end_token_id": id("<|vision_end|>"),
-            "vision_token_id": id("<|vision_pad|>"),
-            "image_token_id": id("<|image_pad|>"),
-            "video_token_id": id("<|video_pad|>"),
-            "hidden_act": "silu",
-            "hidden_size": 192,
-            "intermediate_size": 512,
-            "num_attention_heads": 4,
-            "num_key_value_heads": 2,
-            "num_hidden_layers": 4,
-            "rms_norm_eps": 1e-6,
-            "rope_theta": 512.0,
-            "rope_scaling": {"type": "mrope", "mrope_section": [8, 8, 8]},
-            "max_position_embeddings": 32768,
-            "use_sliding_window": false,
-            "tie_word_embeddings": true,
-            "torch_dtype": "bfloat16",
-            "vocab_size": vocab,
-            "vision_config": {
-                "hidden_act": "silu",
-                "depth": 4,
-                "hidden_size": 128,
-                "intermediate_size": 344,
-                "num_heads": 4,
-                "in_chans": 3,
-                "patch_size": 8,
-                "spatial_patch_size": 8,
-                "spatial_merge_size": 2,
-                "temporal_patch_size": 2,
-                "window_size": 64,
-                "fullatt_block_indexes": [1, 3],
-                "out_hidden_size": 192,
-            },
-        });
-        let preprocessor = json!({
-            "image_processor_type": "Qwen2VLImageProcessor",
-            "min_pixels": 16384,
-            "max_pixels": 49152,
-            "patch_size": 8,
-            "temporal_patch_size": 2,
-            "merge_size": 2,
-            "image_mean": [0.48145466, 0.4578275, 0.40821073],
-            "image_std": [0.26862954, 0.26130258, 0.27577711],
-        });
         let text = |what: &str, value: &Value| {
             serde_json::to_string_pretty(value).map_err(|e| Error::format(what, e.to_string(), "JSON"))
         };
-        Ok(Self {
-            config: text("config.json", &config)?,
-            preprocessor: text("preprocessor_config.json", &preprocessor)?,
+        let files = Self {
+            config: text(CONFIG, &shape.config(numbers))?,
+            preprocessor: text(PREPROCESSOR, &shape.preprocessor())?,
             settings: settings.to_json()?,
             tokenizer: byte_tokenizer(numbers).to_string(),
-        })
+        };
+        files.parse()?;
+        Ok(files)
+    }
+
+    /// Writes the four files into a checkpoint directory.
+    ///
+    /// # Errors
+    /// [`Error::Io`].
+    pub fn write(&self, dir: &Path) -> Result<()> {
+        std::fs::create_dir_all(dir).map_err(Error::io(dir))?;
+        for (name, text) in [
+            (CONFIG, &self.config),
+            (PREPROCESSOR, &self.preprocessor),
+            (SETTINGS, &self.settings),
+            (TOKENIZER, &self.tokenizer),
+        ] {
+            write_whole(&dir.join(name), text.as_bytes())?;
+        }
+        Ok(())
+    }
+
+    /// Initial values of all tensors of a model of these files, by [`initial`].
+    ///
+    /// # Errors
+    /// As [`FreshFiles::parse`] and [`initial`]; [`Error::Config`] if the patches of the two files differ.
+    pub fn initial(&self, seed: u64) -> Result<BTreeMap<String, Tensor>> {
+        let parsed = self.parse()?;
+        let layers = parsed.config.text.layers;
+        let number_ids = Numbers::new(parsed.settings.number, &parsed.tokenizer)?.ids;
+        let empty = Weights::from_tensors("fresh", Default::default());
+        // Building on nothing fails, but not before each tensor was asked for.
+        match SdimModel::new(parsed, &empty, &Device::Cpu) {
+            Err(Error::TensorSet { .. }) => initial(&empty.wanted(), &number_ids, layers, seed),
+            Err(other) => Err(other),
+            Ok(_) => Err(Error::argument("layout", "no tensors", "a model with weights")),
+        }
+    }
+
+    /// Writes a checkpoint directory with the initial values, in f32: where training starts.
+    ///
+    /// # Errors
+    /// As [`FreshFiles::initial`]; [`Error::Io`].
+    pub fn write_initial(&self, dir: &Path, seed: u64) -> Result<()> {
+        self.write(dir)?;
+        write_tensors(&dir.join("model.safetensors"), &self.initial(seed)?)
     }
 
     /// Parses them as a loader would.

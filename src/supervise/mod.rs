@@ -5,6 +5,7 @@ pub mod evaluate;
 pub mod init;
 pub mod loss;
 pub mod optimiser;
+pub mod shape;
 pub mod store;
 pub mod trainer;
 

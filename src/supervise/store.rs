@@ -3,7 +3,7 @@
 use super::init::FreshFiles;
 use super::optimiser::Parameters;
 use crate::error::{Error, Result};
-use crate::files::{write_tensors, write_whole};
+use crate::files::write_tensors;
 use candle_core::{DType, Device, Tensor};
 use std::collections::HashMap;
 use std::path::Path;
@@ -19,15 +19,7 @@ pub fn publish(dir: &Path, files: &FreshFiles, parameters: &Parameters) -> Resul
         tensors.insert(name, tensor.to_dtype(DType::BF16)?);
     }
     write_tensors(&dir.join("model.safetensors"), &tensors)?;
-    for (name, text) in [
-        ("config.json", &files.config),
-        ("preprocessor_config.json", &files.preprocessor),
-        ("sdim.json", &files.settings),
-        ("tokenizer.json", &files.tokenizer),
-    ] {
-        write_whole(&dir.join(name), text.as_bytes())?;
-    }
-    Ok(())
+    files.write(dir)
 }
 
 /// Writes `trainer.safetensors`: values, moments and averages in f32, and the number of finished steps.

@@ -1,7 +1,7 @@
 //! The training loop.
 
 use super::batch::{self, BatchConfig, Example};
-use super::init::{FreshFiles, initial};
+use super::init::FreshFiles;
 use super::loss::{self, BinLoss, LossParts};
 use super::optimiser::{AdamW, Parameters};
 use super::store;
@@ -100,17 +100,7 @@ impl Trainer {
             return Err(Error::argument("pixel_reference", "marker", expected));
         }
         let files = FreshFiles::tiny(settings)?;
-        let empty = Weights::from_tensors("fresh", Default::default());
-        let parsed = files.parse()?;
-        let layers = parsed.config.text.layers;
-        // Building on nothing fails, but not before each tensor was asked for.
-        let number_ids = crate::query::number::Numbers::new(settings.number, &parsed.tokenizer)?.ids;
-        match SdimModel::new(parsed, &empty, &Device::Cpu) {
-            Err(Error::TensorSet { .. }) => {}
-            Err(other) => return Err(other),
-            Ok(_) => return Err(Error::argument("layout", "no tensors", "a model with weights")),
-        }
-        let start = initial(&empty.wanted(), &number_ids, layers, config.seed)?;
+        let start = files.initial(config.seed)?;
         let parameters = Parameters::new(start)?;
         let weights = Weights::from_tensors("training", parameters.tensors());
         let model = SdimModel::new(files.parse()?, &weights, &Device::Cpu)?;
