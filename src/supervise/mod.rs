@@ -5,7 +5,9 @@ pub mod evaluate;
 pub mod init;
 pub mod loss;
 pub mod optimiser;
+pub mod records;
 pub mod shape;
+pub mod shard;
 pub mod store;
 pub mod trainer;
 
