@@ -165,6 +165,10 @@ pub mod internals {
     pub mod supervise {
         pub use crate::supervise::batch::*;
         pub use crate::supervise::init::*;
+        pub use crate::supervise::loss::*;
+        pub use crate::supervise::records::*;
+        pub use crate::supervise::shape::*;
+        pub use crate::supervise::shard::*;
     }
     pub mod vlm {
         pub use crate::vlm::*;

@@ -80,7 +80,7 @@ impl Adapter {
     #[doc(hidden)]
     pub fn fresh(config: &VlmConfig, settings: Settings, seed: u64) -> Result<Self> {
         let layout = Self::layout(config, &settings)?;
-        let tensors = crate::supervise::init::initial(&layout, &[], config.text.layers, seed)?;
+        let tensors = super::initial::initial(&layout, &[], config.text.layers, seed)?;
         Ok(Self { settings, tensors })
     }
 }

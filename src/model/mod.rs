@@ -8,6 +8,8 @@ mod batch;
 mod encode;
 mod files;
 mod generate;
+#[cfg(feature = "train")]
+mod initial;
 mod load;
 mod marked;
 mod parts;
@@ -19,6 +21,8 @@ pub use ask::{AskOptions, ask, generate};
 pub use encode::scatter;
 pub use files::{CheckpointFiles, SETTINGS, TENSORS};
 pub use generate::FreeAnswer;
+#[cfg(feature = "train")]
+pub use initial::initial;
 #[cfg(feature = "tiny")]
 pub use load::tiny;
 pub use parts::DepthInjection;

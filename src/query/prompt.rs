@@ -53,7 +53,7 @@ impl Tokens {
     }
 
     /// Tokens that say a number at a pixel; the first one carries the crop.
-    fn push_at(&mut self, ids: &[u32], (x, y): (usize, usize), time: f32, space: &FrameSpace) {
+    pub(crate) fn push_at(&mut self, ids: &[u32], (x, y): (usize, usize), time: f32, space: &FrameSpace) {
         self.glimpses.push(Glimpse {
             token: self.len(),
             x: centre(x, space.width, space.resized.0),
@@ -102,8 +102,8 @@ pub struct FrameSpace {
 }
 
 /// Time offset of a measurement and of a query from the image's own time, where they stand at a pixel.
-const MEASURED_TIME: f32 = 1.0;
-const QUERY_TIME: f32 = 2.0;
+pub(crate) const MEASURED_TIME: f32 = 1.0;
+pub(crate) const QUERY_TIME: f32 = 2.0;
 
 /// Where a pixel's centre falls on a coarser axis: 0 is the centre of its first cell.
 fn centre(p: usize, size: usize, cells: usize) -> f32 {

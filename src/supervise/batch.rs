@@ -2,12 +2,14 @@
 
 use crate::depth::interpolate::Interpolator;
 use crate::depth::{SparseDepth, SparsePattern};
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::model::{SdimModel, scatter};
-use crate::query::Query;
 use crate::query::prompt::Tokens;
+use crate::query::{PromptWriter, Query};
 use crate::scenes::sensor::{CameraModel, DepthSensor};
 use crate::scenes::{RgbdFrame, procedural};
+use crate::vlm::chat::tokenizer::Tokenizer;
+use crate::vlm::qwen2_5::config::VlmConfig;
 use crate::vlm::qwen2_5::grid::Grid;
 use crate::vlm::qwen2_5::preprocess::Pixels;
 use image::RgbImage;
@@ -68,6 +70,8 @@ pub struct Example {
     pub pixels: Pixels,
     /// Scattered measurements in number units, row-major.
     pub scattered: Vec<f32>,
+    /// Metres per number unit.
+    pub unit: f32,
     /// The shared prefix.
     pub prefix: Tokens,
     /// Suffixes with their answers' tokens (all but the last one appended), shortest first.
@@ -84,6 +88,8 @@ pub struct Item {
     pub answer: Vec<usize>,
     /// The answer in number units.
     pub value: f32,
+    /// What interpolation of the measurements says here, in number units.
+    pub hint: f32,
     /// The frame's largest measurement in number units: what its errors are counted in, so that frames of near and of
     /// far things weigh alike.
     pub largest: f32,
@@ -95,6 +101,17 @@ pub fn mix(seed: u64, counter: u64) -> u64 {
     z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
     z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
     z ^ (z >> 31)
+}
+
+/// Seeds of scenes, cut into ranges that share none, so that what scores a model was never trained on: training draws from
+/// here, below are those of evaluations that count their scenes, above those of held-out records.
+pub fn training_seed(random: u64) -> u64 {
+    random >> 2 | 1 << 62
+}
+
+/// Seeds of scenes that are held out, for records; see [`training_seed`].
+pub fn held_out_seed(random: u64) -> u64 {
+    random >> 1 | 1 << 63
 }
 
 /// Makes the examples of one step, in parallel; the same seed and step give the same batch.
@@ -118,35 +135,92 @@ pub fn make(model: &SdimModel, config: &BatchConfig, seed: u64, step: u64) -> Re
         .collect()
 }
 
+/// What a checkpoint writes questions with: all of it but the weights.
+#[derive(Clone, Copy)]
+pub struct Asking<'a> {
+    /// Sizes of the model.
+    pub config: &'a VlmConfig,
+    /// Its words and numbers.
+    pub prompts: &'a PromptWriter,
+    /// Its vocabulary.
+    pub tokenizer: &'a Tokenizer,
+}
+
+impl<'a> From<&'a SdimModel> for Asking<'a> {
+    fn from(model: &'a SdimModel) -> Self {
+        Self { config: &model.vlm.config, prompts: &model.prompts, tokenizer: &model.tokenizer }
+    }
+}
+
+/// The frame of a seed, as it is trained on: a scene, mirrored and recoloured. All training data come from here.
+///
+/// # Errors
+/// Errors of the scenes.
+pub fn frame(seed: u64, size: (usize, usize)) -> Result<RgbdFrame> {
+    let mut frame = procedural(seed, size.0, size.1)?;
+    augment(&mut frame, &mut ChaCha8Rng::seed_from_u64(mix(seed, 1)));
+    Ok(frame)
+}
+
 fn example(model: &SdimModel, config: &BatchConfig, seed: u64, size: (usize, usize)) -> Result<Example> {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let mut frame = procedural(rng.random(), size.0, size.1)?;
-    augment(&mut frame, &mut rng);
-    let measured = measure(&mut frame, config, &mut rng)?;
+    let frame = frame(training_seed(rng.random()), size)?;
+    example_of(model.into(), config, &frame, &mut rng)
+}
+
+/// Measures a frame and asks about it.
+///
+/// # Errors
+/// [`crate::Error::NoMeasurement`] if nothing can be measured or asked; errors of the prompt writer.
+pub fn example_of(
+    asking: Asking,
+    config: &BatchConfig,
+    frame: &RgbdFrame,
+    rng: &mut ChaCha8Rng,
+) -> Result<Example> {
+    let mut frame = frame.clone();
+    let measured = measure(&mut frame, config, rng)?;
     let (prompted, held_back) = match config.labels {
         LabelSource::Dense => (measured, None),
-        LabelSource::Sparse => split(&measured, &mut rng)?,
+        LabelSource::Sparse => split(&measured, rng)?,
     };
+    let asked = questions(&frame, held_back.as_ref(), config.questions, rng);
+    written(asking, &frame.rgb, &prompted, config.prompt_points, &asked, rng.random())
+}
+
+/// Writes questions about a frame, whose sides are multiples of patch x merge. `asked` holds pixels with their true depth in
+/// metres, `seed` draws which measurements are told, `prompt_points` at most, and in which order.
+///
+/// # Errors
+/// [`crate::Error::NoMeasurement`] without a measurement or a question; errors of the prompt writer.
+pub fn written(
+    asking: Asking,
+    rgb: &RgbImage,
+    prompted: &SparseDepth,
+    prompt_points: usize,
+    asked: &[(usize, usize, f32)],
+    seed: u64,
+) -> Result<Example> {
     prompted.require_points()?;
-    let (width, height) = size;
-    let merge = model.vlm.config.vision.merge_size * model.vlm.config.vision.patch_size;
-    let grid = Grid {
-        height: height / merge * model.vlm.config.vision.merge_size,
-        width: width / merge * model.vlm.config.vision.merge_size,
-    };
-    let writer = &model.prompts;
+    let (width, height) = (rgb.width() as usize, rgb.height() as usize);
+    if asked.is_empty() {
+        return Err(Error::NoMeasurement { width, height });
+    }
+    let vision = &asking.config.vision;
+    let grid = Grid { height: height / vision.patch_size, width: width / vision.patch_size };
+    let writer = asking.prompts;
     let (prefix, space) =
-        writer.prefix_of(&prompted, config.prompt_points, grid, size, &model.vlm.config, rng.random())?;
+        writer.prefix_of(prompted, prompt_points, grid, (width, height), asking.config, seed)?;
 
     let points: Vec<(f32, f32)> = prompted.points().map(|(x, y, _)| (x as f32, y as f32)).collect();
     let values: Vec<f32> = prompted.points().map(|p| p.2).collect();
     let interpolator = Interpolator::new(&points, width, height)?;
     let largest = prompted.max().unwrap_or(space.unit) / space.unit;
-    let mut items = Vec::with_capacity(config.questions);
-    for (x, y, depth) in questions(&frame, held_back.as_ref(), config.questions, &mut rng) {
-        let query =
-            Query { x, y, measured: prompted.get(x, y), hint: interpolator.at(x as f32, y as f32, &values) };
-        let mut tokens = writer.suffix(&query, &space, &model.tokenizer)?;
+    let mut items = Vec::with_capacity(asked.len());
+    for &(x, y, depth) in asked {
+        let hint = interpolator.at(x as f32, y as f32, &values);
+        let query = Query { x, y, measured: prompted.get(x, y), hint };
+        let mut tokens = writer.suffix(&query, &space, asking.tokenizer)?;
         let value = depth / space.unit;
         let answer = writer.numbers().write(value);
         let mut p = tokens.next_text(&space);
@@ -155,11 +229,13 @@ fn example(model: &SdimModel, config: &BatchConfig, seed: u64, size: (usize, usi
             tokens.positions.push(crate::vlm::qwen2_5::rope::Position::text(p));
             p += 1.0;
         }
-        items.push(Item { tokens, supervised: answer.len(), answer, value, largest });
+        let (supervised, hint) = (answer.len(), hint / space.unit);
+        items.push(Item { tokens, supervised, answer, value, hint, largest });
     }
     items.sort_by_key(|i| i.tokens.len());
-    let scattered = scatter(&prompted, width, height, space.unit);
-    Ok(Example { pixels: Pixels { resized: frame.rgb, grid }, scattered, prefix, items })
+    let scattered = scatter(prompted, width, height, space.unit);
+    let pixels = Pixels { resized: rgb.clone(), grid };
+    Ok(Example { pixels, scattered, unit: space.unit, prefix, items })
 }
 
 /// Mirrors, drops the colour or mixes the channels of a frame.
@@ -221,7 +297,7 @@ fn split(measured: &SparseDepth, rng: &mut ChaCha8Rng) -> Result<(SparseDepth, O
 }
 
 /// Pixels to ask and their true depths.
-fn questions(
+pub(super) fn questions(
     frame: &RgbdFrame,
     held_back: Option<&SparseDepth>,
     count: usize,

@@ -3,7 +3,7 @@
 use super::init::FreshFiles;
 use super::optimiser::Parameters;
 use crate::error::{Error, Result};
-use crate::files::{write_tensors, write_whole};
+use crate::files::write_tensors;
 use crate::vlm::checkpoint::weights::Weights;
 use candle_core::{DType, Device, Tensor};
 use std::collections::HashMap;
@@ -50,9 +50,7 @@ pub fn publish(dir: &Path, files: &FreshFiles, parameters: &Parameters) -> Resul
     let model = dir.join(MODEL);
     if !FreshFiles::load(dir).is_ok_and(|there| there == *files) {
         remove(&model)?;
-        for (name, text) in files.named() {
-            write_whole(&dir.join(name), text.as_bytes())?;
-        }
+        files.write(dir)?;
     }
     write_tensors(&model, &tensors)
 }

@@ -2,7 +2,7 @@
 
 use super::batch::{self, Example};
 use super::config::{CONFIG, TrainConfig};
-use super::init::{FreshFiles, initial};
+use super::init::FreshFiles;
 use super::loss::{self, BinLoss, LossParts, Target};
 use super::optimiser::{Gradients, Parameters};
 use super::pass;
@@ -11,7 +11,7 @@ use crate::error::{Error, Result};
 use crate::fusion::{BatchStats, Normalise};
 use crate::kernels;
 use crate::model::{SETTINGS, SdimModel};
-use crate::query::number::{NumberFormat, Numbers, POINT};
+use crate::query::number::{NumberFormat, POINT};
 use crate::query::{AnswerMode, PixelReference, Settings};
 use crate::vlm::checkpoint::weights::Weights;
 use candle_core::Device;
@@ -95,23 +95,15 @@ impl Trainer {
     fn start(config: TrainConfig, files: FreshFiles, dir: &Path) -> Result<Self> {
         let place = |name: &str| dir.join(name).display().to_string();
         config.validate(&place(CONFIG))?;
-        let empty = Weights::from_tensors("fresh", Default::default());
         let parsed = files.parse_of(dir)?;
         check_settings(&parsed.settings, &place(SETTINGS))?;
-        let (layers, vision) = (parsed.config.text.layers, &parsed.config.vision);
+        let vision = &parsed.config.vision;
         let side = vision.patch_size * vision.merge_size;
         if let Some(size) = config.batch.sizes.iter().find(|s| s.0 % side != 0 || s.1 % side != 0) {
             let expected = format!("sides that are multiples of {side} pixels");
             return Err(Error::config(&place(CONFIG), "batch.sizes", format!("{size:?}"), expected));
         }
-        // Building on nothing fails, but not before each tensor was asked for.
-        let number_ids = Numbers::new(parsed.settings.number, &parsed.tokenizer)?.ids;
-        match SdimModel::new(parsed, &empty, &Device::Cpu) {
-            Err(Error::TensorSet { .. }) => {}
-            Err(other) => return Err(other),
-            Ok(_) => return Err(Error::argument("layout", "no tensors", "a model with weights")),
-        }
-        let parameters = Parameters::new(initial(&empty.wanted(), &number_ids, layers, config.seed)?)?;
+        let parameters = Parameters::new(files.initial(config.seed)?)?;
         let weights = Weights::from_tensors("training", parameters.tensors());
         let model = SdimModel::new(files.parse()?, &weights, &Device::Cpu)?;
         Ok(Self { config, files, parameters, model, progress: Progress::default(), prefetched: None })

@@ -3,9 +3,9 @@
 use candle_core::{Device, Tensor};
 use image::{Rgb, RgbImage};
 use sdim::SparseDepth;
-use sdim::internals::model::SdimModel;
+use sdim::internals::model::{SdimModel, initial};
 use sdim::internals::query::number::Numbers;
-use sdim::internals::supervise::{FreshFiles, initial};
+use sdim::internals::supervise::FreshFiles;
 use sdim::internals::vlm::checkpoint::weights::Weights;
 use sdim::settings::Settings;
 use std::collections::HashMap;

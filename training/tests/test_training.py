@@ -1,0 +1,105 @@
+"""Training on the fixture's records: it learns, resumes bit for bit, survives bad numbers, and publishes what was averaged."""
+
+import csv
+import shutil
+
+import pytest
+import torch
+from make_fixture import FIXTURE
+from safetensors.torch import load_file
+
+from sdim_training import checkpoint, train
+from sdim_training.records import Pool, assemble
+
+CPU = torch.device("cpu")
+
+
+def arguments(tmp_path, *more):
+    """Records and a checkpoint beside each other, as the crate writes them."""
+    records = tmp_path / "records"
+    records.mkdir(exist_ok=True)
+    shutil.copy(FIXTURE / "000000.safetensors", records)
+    chosen = ["--records", records, "--init", FIXTURE / "checkpoint", "--out", tmp_path / "out", "--batch", "2"]
+    chosen += ["--steps", "8", "--warmup", "2", "--log-every", "1", "--evaluate-every", "0.5", *more]
+    return train.options([str(c) for c in chosen])
+
+
+def trainer_and_batch(tmp_path, *more):
+    trainer = train.Trainer(arguments(tmp_path, *more), CPU)
+    pool = Pool(tmp_path / "records", trainer.config.sdim)
+    pool.refresh()
+    return trainer, pool, assemble(pool.draw(1, 0, 2))
+
+
+def test_the_loss_falls(tmp_path):
+    trainer, _, batch = trainer_and_batch(tmp_path, "--rate", "3e-3")
+    losses = [trainer.train_step(batch, 0.5)[0] for _ in range(25)]
+    assert losses[-1] < 0.7 * losses[0], losses
+
+
+def test_a_resumed_run_is_the_run_bit_for_bit(tmp_path):
+    def ran(name, *more):
+        return train.run(arguments(tmp_path / name, *more), CPU)
+
+    for name in ("whole", "parts"):
+        (tmp_path / name).mkdir()
+    whole = ran("whole", "--held-out", FIXTURE)
+    ran("parts", "--stop-at", "3")
+    parts = ran("parts", "--resume", "--held-out", FIXTURE)
+    assert whole.step == parts.step == 8
+    for old, new in ((whole.model, parts.model), (whole.average, parts.average)):
+        for (name, a), b in zip(old.state_dict().items(), new.state_dict().values(), strict=True):
+            assert torch.equal(a, b), name
+    with open(tmp_path / "whole/out/curve.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert {int(r["step"]) for r in rows} == set(range(9)) and float(rows[-1]["geometric_records"]) > 0
+    published = load_file(tmp_path / "whole/out/model.safetensors")
+    for name, value in whole.average.state_dict().items():
+        assert torch.equal(published[name], value.bfloat16()), name
+    assert published.keys() == load_file(FIXTURE / "checkpoint/model.safetensors").keys()
+    assert all((tmp_path / "whole/out" / n).read_text() == (FIXTURE / "checkpoint" / n).read_text() for n in checkpoint.FILES)
+    with pytest.raises(SystemExit, match="rate 0.0012 there, 0.5 now"):
+        ran("parts", "--resume", "--rate", "0.5")
+
+
+def test_steps_that_are_not_finite_change_nothing(tmp_path):
+    trainer, _, batch = trainer_and_batch(tmp_path)
+    trainer.train_step(batch, 0.0)
+    before = [{k: v.clone() for k, v in m.state_dict().items()} for m in (trainer.model, trainer.average)]
+    trainer.train_step(batch._replace(value=batch.value * float("nan")), 0.0)
+    trainer.train_step(batch._replace(depth=batch.depth * float("inf")), 0.0)
+    assert trainer.skipped == 2 and trainer.step == 3
+    for old, model in zip(before, (trainer.model, trainer.average)):
+        assert all(torch.equal(v, old[k]) for k, v in model.state_dict().items())
+    trainer.train_step(batch, 0.0)
+    assert trainer.in_a_row == 0 and not torch.equal(trainer.model.model.norm.weight, before[0]["model.norm.weight"])
+
+
+def test_statistics_are_measured_up_to_half_and_averaged_like_weights(tmp_path):
+    trainer, _, batch = trainer_and_batch(tmp_path)
+    norm, average = (m.sdim["fusion"].depth.bn for m in (trainer.model, trainer.average))
+    start = norm.running_var.clone()
+    trainer.train_step(batch, 0.49)
+    moved = norm.running_var.clone()
+    assert not torch.equal(moved, start)
+    torch.testing.assert_close(average.running_var, start + (1 - 2 / 11) * (moved - start))
+    trainer.train_step(batch, 0.5)
+    assert torch.equal(norm.running_var, moved)
+
+
+def test_a_mirrored_frame_mirrors_all_of_it(tmp_path):
+    _, pool, _ = trainer_and_batch(tmp_path)
+    plain, turned = (assemble([(pool.shards[0], 1, 0, m)]) for m in (False, True))
+    assert torch.equal(plain.rgb.flip(2), turned.rgb) and torch.equal(plain.depth.flip(2), turned.depth)
+    for name in ("told_at", "asked_at"):
+        a, b = getattr(plain, name), getattr(turned, name)
+        assert torch.equal(a[..., 0] + b[..., 0], torch.full_like(a[..., 0], 79)) and torch.equal(a[..., 1], b[..., 1])
+    # Told measurements lie where the fusion block sees them.
+    x, y = turned.told_at[0, : turned.told_count[0]].long().unbind(-1)
+    assert (turned.depth[0, y, x] > 0).all()
+
+
+def test_other_records_are_refused(tmp_path):
+    trainer, _, _ = trainer_and_batch(tmp_path)
+    with pytest.raises(ValueError, match="settings are not those"):
+        Pool(tmp_path / "records", trainer.config.sdim | {"glimpse": 8}).refresh()
