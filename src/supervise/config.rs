@@ -139,7 +139,7 @@ mod tests {
     fn what_is_written_is_read_back() {
         let dir = tempfile::tempdir().unwrap();
         let mut config = TrainConfig { rate: 1.0 / 3.0, seed: u64::MAX, ..Default::default() };
-        config.batch.labels = super::super::batch::LabelSource::Sparse;
+        config.batch.labels = crate::supervise::LabelSource::Sparse;
         config.optimiser.eps = f32::MIN_POSITIVE;
         config.save(dir.path()).unwrap();
         assert_eq!(TrainConfig::load(dir.path()).unwrap(), config);
@@ -149,14 +149,15 @@ mod tests {
     fn what_is_wrong_with_a_file_is_told() {
         let dir = tempfile::tempdir().unwrap();
         assert!(matches!(TrainConfig::load(dir.path()), Err(Error::Io { .. })));
-        let read = |change: fn(&mut serde_json::Value)| {
+        type Change = fn(&mut serde_json::Value);
+        let read = |change: Change| {
             let mut json = serde_json::to_value(TrainConfig::default()).unwrap();
             change(&mut json);
             std::fs::write(dir.path().join(CONFIG), json.to_string()).unwrap();
             TrainConfig::load(dir.path())
         };
         assert_eq!(read(|_| {}).unwrap(), TrainConfig::default());
-        let damaged: [fn(&mut serde_json::Value); 6] = [
+        let damaged: [Change; 6] = [
             |j| *j = "cut".into(),
             |j| drop(j.as_object_mut().unwrap().remove("seed")),
             |j| j["step"] = 7.into(),
@@ -170,7 +171,7 @@ mod tests {
                 other => panic!("{other:?}"),
             }
         }
-        let wrong: [(&str, fn(&mut serde_json::Value)); 5] = [
+        let wrong: [(&str, Change); 5] = [
             ("steps", |j| j["steps"] = 0.into()),
             ("rate", |j| j["rate"] = (-0.1).into()),
             ("batch.points", |j| j["batch"]["points"] = serde_json::json!([40, 30])),

@@ -56,6 +56,9 @@ fn the_model_that_is_trained_is_the_one_that_its_values_load_as() {
 
 #[test]
 fn errors_in_metres_are_counted_in_the_largest_measurement() {
+    let tiny = Trainer::new(small(), &Settings::tiny()).unwrap();
+    let examples = tiny.make_batch(0).unwrap();
+    assert!(examples[0].items.iter().all(|i| i.largest == 1.0), "it is the frame's own unit");
     let metres = Settings {
         unit: DepthUnit::Metres,
         number: NumberFormat::Bins { bins: 1000, range: 100.0 },
