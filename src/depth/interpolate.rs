@@ -2,8 +2,9 @@
 
 use rayon::prelude::*;
 
+use super::linear::Linear;
 use super::mesh::{Mesh, Owner, cross};
-use super::{SparseDepth, check_length, faces_a_hole, pixel_count};
+use super::{SparseDepth, check_length, pixel_count};
 use crate::error::Result;
 
 /// Gives every pixel the depth of the nearest measured pixel (Euclidean, exact). `width * height` metres.
@@ -48,24 +49,7 @@ fn from_nearest(
 /// # Errors
 /// [`Error::NoMeasurement`](crate::error::Error::NoMeasurement) for a map without measurements.
 pub fn linear(sparse: &SparseDepth) -> Result<Vec<f32>> {
-    sparse.require_points()?;
-    let (width, height) = (sparse.width(), sparse.height());
-    if sparse.measured() == width * height {
-        return Ok(sparse.as_slice().to_vec());
-    }
-    // The triangles at a point with eight measured neighbours are the small ones towards them and hold no missing pixel, so
-    // such points can be left out without changing the result. In dense maps this saves nearly all of the work.
-    let at_a_hole = |x, y| faces_a_hole(sparse.as_slice(), width, height, x, y);
-    let edge: Vec<_> = sparse.points().filter(|&(x, y, _)| at_a_hole(x, y)).collect();
-    let positions: Vec<_> = edge.iter().map(|&(x, y, _)| (x as f32, y as f32)).collect();
-    let values: Vec<_> = edge.iter().map(|&(_, _, depth)| depth).collect();
-    let mut out = Interpolator::new(&positions, width, height)?.raster(&values);
-    for (pixel, &depth) in out.iter_mut().zip(sparse.as_slice()) {
-        if !depth.is_nan() {
-            *pixel = depth;
-        }
-    }
-    Ok(out)
+    Ok(Linear::new(sparse)?.raster())
 }
 
 /// No measurement in this column.
@@ -152,6 +136,10 @@ impl Interpolator {
         Ok(Self { mesh: Mesh::new(points, width, height)?, points: points.len() })
     }
 
+    pub(crate) fn mesh(&self) -> &Mesh {
+        &self.mesh
+    }
+
     /// Number of points given to [`Interpolator::new`]: the number of values to pass.
     pub fn points(&self) -> usize {
         self.points
@@ -194,6 +182,23 @@ impl Interpolator {
         check_length("raster", out.len(), pixel_count(self.mesh.width, self.mesh.height)?)?;
         self.paint(values, out);
         Ok(())
+    }
+
+    /// The points whose values make the value at a pixel of the frame, with their weights, which sum to 1.
+    pub(crate) fn weights_at(&self, x: usize, y: usize) -> [(usize, f32); 3] {
+        let point = |site: usize| self.mesh.origin[site];
+        match self.mesh.owner(x, y) {
+            Owner::Site(site) => [(point(site), 1.0), (point(site), 0.0), (point(site), 0.0)],
+            Owner::Triangle(triangle) => {
+                let (p, corners) = ([x as f64, y as f64], self.mesh.corners(triangle));
+                let area = cross(corners[0], corners[1], corners[2]);
+                let sites = self.mesh.triangles[triangle];
+                std::array::from_fn(|i| {
+                    let part = cross(corners[(i + 1) % 3], corners[(i + 2) % 3], p) / area;
+                    (point(sites[i] as usize), part.clamp(0.0, 1.0) as f32)
+                })
+            }
+        }
     }
 
     fn paint(&self, values: &[f32], out: &mut [f32]) {
