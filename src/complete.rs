@@ -1,5 +1,6 @@
 //! The one function that users call: an RGB frame and sparse depth in, dense depth out.
 
+mod alignment;
 mod questions;
 
 use crate::depth::{DepthMap, SparseDepth};
@@ -249,13 +250,13 @@ impl DepthCompleter {
         let span = tracing::info_span!("queries").entered();
         let mark = Instant::now();
         let questions = Questions::new(&self.model, &prefix, sparse, options)?;
-        let (answers, residual) = questions.ask_all()?;
+        let answers = questions.ask_all()?;
         drop(span);
         seconds.queries = mark.elapsed().as_secs_f64();
         let _refine = tracing::info_span!("refine").entered();
         let mark = Instant::now();
-        let asked = answers.len() + residual.points.len();
-        let map = questions.dense(rgb, answers, &residual)?;
+        let asked = answers.asked;
+        let map = questions.dense(rgb, answers)?;
         seconds.refine = mark.elapsed().as_secs_f64();
         seconds.total = start.elapsed().as_secs_f64();
         Ok(Completion { map, asked, seconds })

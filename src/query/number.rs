@@ -79,7 +79,7 @@ impl Reading {
 }
 
 /// Half-width of the interval whose probability is the confidence, relative to the answer.
-pub(super) const CONFIDENT_WITHIN: f32 = 0.05;
+pub(crate) const CONFIDENT_WITHIN: f32 = 0.05;
 
 impl NumberFormat {
     /// Checks the sizes of a configuration.
