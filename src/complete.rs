@@ -1,8 +1,10 @@
 //! The one function that users call: an RGB frame and sparse depth in, dense depth out.
 
 mod alignment;
+mod belief;
 mod questions;
 
+use crate::depth::outliers::Outlier;
 use crate::depth::{DepthMap, SparseDepth};
 use crate::error::{Error, Result};
 use crate::model::{LoadOptions, SdimModel};
@@ -26,6 +28,19 @@ pub enum Preserve {
     /// They are asked like any other pixel where the plan comes to them, with mask 1 as in the paper where the template has
     /// mask sentences; where it does not, they are filled from answers.
     Ask,
+}
+
+/// What becomes of measurements that their neighbours, the picture and the model's own answer contradict
+/// ([`Completion::flagged`]): saturated pixels, rays that went astray, left-overs of rectification.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Outliers {
+    /// Their pixels are completed as if nothing had been measured there.
+    #[default]
+    Ignore,
+    /// As `Ignore`, but the map keeps their measurement, where it keeps measurements at all ([`Preserve::Keep`]).
+    Preserve,
+    /// Measurements are not checked: all of them count, and none is flagged.
+    Trust,
 }
 
 /// How far a frame is.
@@ -63,6 +78,8 @@ pub struct CompleteOptions {
     pub plan: QueryPlan,
     /// What becomes of measured pixels.
     pub preserve: Preserve,
+    /// What becomes of measurements that are not plausible.
+    pub outliers: Outliers,
     /// How answers are got; `None` for the checkpoint's own way (`answer_mode` of `sdim.json`).
     pub answer: Option<AnswerMode>,
     /// Whether to ask at measured pixels too and to spread the difference over the map, so that it passes through the
@@ -84,6 +101,7 @@ impl Default for CompleteOptions {
         Self {
             plan: QueryPlan::default(),
             preserve: Preserve::default(),
+            outliers: Outliers::default(),
             answer: None,
             align: true,
             max_memory: None,
@@ -99,6 +117,7 @@ impl std::fmt::Debug for CompleteOptions {
         f.debug_struct("CompleteOptions")
             .field("plan", &self.plan)
             .field("preserve", &self.preserve)
+            .field("outliers", &self.outliers)
             .field("answer", &self.answer)
             .field("align", &self.align)
             .field("max_memory", &self.max_memory)
@@ -109,6 +128,8 @@ impl std::fmt::Debug for CompleteOptions {
 /// Seconds spent in each stage.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct StageSeconds {
+    /// Checking the measurements, with what is asked about them.
+    pub check: f64,
     /// Preprocessing, fusion and vision encoder.
     pub encode: f64,
     /// Reading the shared prefix.
@@ -126,8 +147,11 @@ pub struct StageSeconds {
 pub struct Completion {
     /// The result.
     pub map: DepthMap,
-    /// Pixels asked, those for alignment included.
+    /// Pixels asked, those for alignment and about doubtful measurements included.
     pub asked: usize,
+    /// Measurements that are not believed, row by row. They are not told to the model, do not define its unit, and take no
+    /// part in hints, alignment and filling; what is expected there is what the map would hold without them.
+    pub flagged: Vec<Outlier>,
     /// Time per stage.
     pub seconds: StageSeconds,
 }
@@ -237,28 +261,19 @@ impl DepthCompleter {
         }
         let mut seconds = StageSeconds::default();
         let _span = tracing::info_span!("complete", width = size.0, height = size.1).entered();
-        let span = tracing::info_span!("encode").entered();
-        let (pixels, scattered) = self.model.preprocess(rgb, sparse)?;
-        let encoded = self.model.encode_frame(rgb, &pixels, &scattered)?;
-        drop(span);
-        seconds.encode = start.elapsed().as_secs_f64();
-        let span = tracing::info_span!("prefill").entered();
-        let mark = Instant::now();
-        let prefix = self.model.read_encoded(&pixels, encoded, sparse)?;
-        drop(span);
-        seconds.prefill = mark.elapsed().as_secs_f64();
+        let believed = self.believe(rgb, sparse, options, &mut seconds)?;
         let span = tracing::info_span!("queries").entered();
         let mark = Instant::now();
-        let questions = Questions::new(&self.model, &prefix, sparse, options)?;
+        let questions = Questions::new(&self.model, &believed.prefix, &believed.sparse, options)?;
         let answers = questions.ask_all()?;
         drop(span);
         seconds.queries = mark.elapsed().as_secs_f64();
         let _refine = tracing::info_span!("refine").entered();
         let mark = Instant::now();
-        let asked = answers.asked;
-        let map = questions.dense(rgb, answers)?;
+        let asked = answers.asked + believed.asked;
+        let (map, flagged) = questions.dense(rgb, answers, &believed.flagged)?;
         seconds.refine = mark.elapsed().as_secs_f64();
         seconds.total = start.elapsed().as_secs_f64();
-        Ok(Completion { map, asked, seconds })
+        Ok(Completion { map, asked, flagged, seconds })
     }
 }

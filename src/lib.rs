@@ -29,7 +29,7 @@ pub mod supervise;
 pub mod system;
 pub mod vlm;
 
-pub use complete::{CancelToken, CompleteOptions, Completion, DepthCompleter, Preserve};
+pub use complete::{CancelToken, CompleteOptions, Completion, DepthCompleter, Outliers, Preserve};
 pub use depth::{DepthMap, DepthScale, SparseDepth};
 pub use error::{Error, Result};
 pub use frame::read_rgb;

@@ -3,7 +3,8 @@
 use image::RgbImage;
 use sdim::scenes::{procedural, sample_points};
 use sdim::{
-    CompleteOptions, DepthCompleter, DepthMap, DepthScale, Error, Preserve, QueryPlan, SparseDepth, read_rgb,
+    CompleteOptions, DepthCompleter, DepthMap, DepthScale, Error, Outliers, Preserve, QueryPlan, SparseDepth,
+    read_rgb,
 };
 use std::sync::{Arc, LazyLock, Mutex};
 
@@ -44,12 +45,13 @@ fn a_budget_is_spent_to_the_last_question() {
         [(40, Preserve::Keep), (700, Preserve::Keep), (4000, Preserve::Keep), (700, Preserve::Ask)]
     {
         let plan = options(QueryPlan::Budget(budget));
-        let spending = CompleteOptions { preserve, ..plan };
+        let spending = CompleteOptions { preserve, outliers: Outliers::Trust, ..plan };
         let done = TINY.complete_detailed(&rgb, &sparse, &spending).unwrap();
         assert_eq!(done.asked, budget + sparse.measured(), "{budget} and the alignment");
         assert_eq!(done.map.valid(), 160 * 120);
     }
-    let all = CompleteOptions { align: false, ..options(QueryPlan::Budget(90_000)) };
+    let all =
+        CompleteOptions { outliers: Outliers::Trust, align: false, ..options(QueryPlan::Budget(90_000)) };
     let done = TINY.complete_detailed(&rgb, &sparse, &all).unwrap();
     assert_eq!(done.asked, 160 * 120 - sparse.measured(), "all that there is to ask");
 }

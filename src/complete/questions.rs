@@ -2,7 +2,8 @@
 //! map that comes of both.
 
 use super::alignment::{Alignment, Anchors};
-use super::{CancelToken, CompleteOptions, Preserve, Progress};
+use super::{CancelToken, CompleteOptions, Outliers, Preserve, Progress};
+use crate::depth::outliers::Outlier;
 use crate::depth::{DepthMap, SparseDepth, interpolate};
 use crate::error::Result;
 use crate::model::SdimModel;
@@ -148,8 +149,14 @@ impl<'a> Questions<'a> {
         refine_pixels(width, height, stride, &answers, budget, |x, y| self.wanted((x, y)))
     }
 
-    /// Aligns the answers, fills the rest, keeps the measurements.
-    pub(super) fn dense(&self, rgb: &RgbImage, answers: Answers) -> Result<DepthMap> {
+    /// Aligns the answers, fills the rest, keeps the measurements; and says what is expected at the flagged ones, which are kept
+    /// where the caller insists.
+    pub(super) fn dense(
+        &self,
+        rgb: &RgbImage,
+        answers: Answers,
+        flagged: &[(usize, usize, f32)],
+    ) -> Result<(DepthMap, Vec<Outlier>)> {
         let (width, height) = (self.sparse.width(), self.sparse.height());
         let alignment = Alignment::new(answers.anchors, width, height)?;
         let asked: Vec<Answered> = (answers.readings)
@@ -173,9 +180,17 @@ impl<'a> Questions<'a> {
         let kept = if self.options.preserve == Preserve::Keep { self.sparse } else { &none };
         let input = FillInput { width, height, rgb, asked: &asked, sparse: kept };
         let mut filled = self.options.fill.fill(&input)?;
+        let expected = |&(x, y, measured): &(usize, usize, f32)| Outlier {
+            x,
+            y,
+            measured,
+            expected: filled.depth[y * width + x],
+        };
+        let outliers = flagged.iter().map(expected).collect();
+        let insisted = if self.options.outliers == Outliers::Preserve { flagged } else { &[] };
         let mut measured = vec![false; width * height];
         if self.options.preserve == Preserve::Keep {
-            for (x, y, depth) in self.sparse.points() {
+            for (x, y, depth) in self.sparse.points().chain(insisted.iter().copied()) {
                 let i = y * width + x;
                 measured[i] = true;
                 filled.depth[i] = depth;
@@ -183,6 +198,8 @@ impl<'a> Questions<'a> {
                 filled.expected_error[i] = 0.0;
             }
         }
-        DepthMap::new(width, height, filled.depth, filled.confidence, filled.expected_error, measured)
+        let map =
+            DepthMap::new(width, height, filled.depth, filled.confidence, filled.expected_error, measured)?;
+        Ok((map, outliers))
     }
 }

@@ -13,6 +13,7 @@ mod map;
 pub(crate) mod mesh;
 pub mod metrics;
 pub mod npy;
+pub mod outliers;
 pub mod png16;
 pub mod preview;
 mod scale;
