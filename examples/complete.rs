@@ -147,9 +147,9 @@ fn main() -> anyhow::Result<()> {
     if args.json {
         let mut object = json!({
             "width": map.width(), "height": map.height(), "measured": sparse.measured(),
-            "asked": done.asked, "valid": map.valid(),
+            "asked": done.asked, "valid": map.valid(), "flagged": done.flagged.len(),
             "seconds": {
-                "load": load_seconds, "encode": s.encode, "prefill": s.prefill,
+                "load": load_seconds, "check": s.check, "encode": s.encode, "prefill": s.prefill,
                 "queries": s.queries, "refine": s.refine, "total": s.total,
             },
             "queries_per_second": per_second, "peak_rss_bytes": peak_rss_bytes(),
@@ -178,6 +178,10 @@ fn main() -> anyhow::Result<()> {
     if let Some((model, nearest)) = &scores {
         let [model, nearest] = [model.mae, nearest.mae].map(rounded);
         lines.push(format!("error   MAE {model} m (nearest neighbour {nearest} m)"));
+    }
+    if !done.flagged.is_empty() {
+        let flagged = done.flagged.len();
+        lines.push(format!("note    {flagged} measurements contradict those around them and were left out"));
     }
     if saturation.pixels > 0 {
         lines.push(format!(

@@ -116,7 +116,7 @@ pub use self::image::read_rgb;
 pub use ::image::RgbImage;
 pub use candle_core::{Device, Tensor};
 pub use complete::{
-    CancelToken, CompleteOptions, Completion, DepthCompleter, Preserve, Progress, ProgressCallback,
+    CancelToken, CompleteOptions, Completion, DepthCompleter, Outliers, Preserve, Progress, ProgressCallback,
     StageSeconds,
 };
 pub use depth::{DepthMap, DepthScale, Intrinsics, SparseDepth};

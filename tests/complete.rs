@@ -4,7 +4,8 @@ use image::RgbImage;
 use sdim::depth::sample_points;
 use sdim::scenes::procedural;
 use sdim::{
-    CompleteOptions, DepthCompleter, DepthMap, DepthScale, Error, Preserve, QueryPlan, SparseDepth, read_rgb,
+    CompleteOptions, DepthCompleter, DepthMap, DepthScale, Error, Outliers, Preserve, QueryPlan, SparseDepth,
+    read_rgb,
 };
 use std::sync::{Arc, LazyLock, Mutex};
 
@@ -35,10 +36,24 @@ fn every_plan_gives_a_complete_map_that_keeps_the_measurements() {
     for plan in [QueryPlan::Every, QueryPlan::Stride(3), QueryPlan::Stride(64), QueryPlan::Budget(700)] {
         let done = TINY.complete_detailed(&rgb, &sparse, &options(plan)).unwrap();
         assert_complete(&done.map, &sparse);
-        if let QueryPlan::Budget(n) = plan {
-            assert!(done.asked <= n + sparse.measured(), "{} asked", done.asked);
-        }
     }
+}
+
+#[test]
+fn a_budget_is_spent_to_the_last_question() {
+    let (rgb, sparse, _) = frame(200);
+    for (budget, preserve) in
+        [(40, Preserve::Keep), (700, Preserve::Keep), (4000, Preserve::Keep), (700, Preserve::Ask)]
+    {
+        let plan = options(QueryPlan::Budget(budget));
+        let spending = plan.with_preserve(preserve).with_outliers(Outliers::Trust);
+        let done = TINY.complete_detailed(&rgb, &sparse, &spending).unwrap();
+        assert_eq!(done.asked, budget + sparse.measured(), "{budget} and the alignment");
+        assert_eq!(done.map.valid(), 160 * 120);
+    }
+    let all = options(QueryPlan::Budget(90_000)).with_outliers(Outliers::Trust).with_align(false);
+    let done = TINY.complete_detailed(&rgb, &sparse, &all).unwrap();
+    assert_eq!(done.asked, 160 * 120 - sparse.measured(), "all that there is to ask");
 }
 
 #[test]
@@ -89,6 +104,8 @@ fn one_point_and_all_points_give_sensible_maps() {
     let done = TINY.complete_detailed(&rgb, &all, &options(QueryPlan::Every)).unwrap();
     assert_eq!(done.map.depth(), full);
     assert_eq!(done.asked, 0, "nothing to ask");
+    let done = TINY.complete_detailed(&rgb, &all, &options(QueryPlan::Budget(500))).unwrap();
+    assert_eq!(done.asked, 0, "nothing to spend a budget on");
 }
 
 #[test]

@@ -11,7 +11,7 @@
 #   SECONDS_TOTAL=600  SHAPE=small  SIZE=384x288  PROMPT=512  QUESTIONS=128  VARIANTS=4  SHARD=64  BATCH=64  RATE=1.5e-3
 #   POINTS=40,1500  HELD_FRAMES=256  WAIT_FRAMES=1024  MAX_GB=30  SEED=7  GPUS and THREADS: all; PYTHON=python3; WORK: a temporary folder
 #   RECORDS_ARGS, TRAIN_ARGS: more arguments for the two programs; INIT: a checkpoint to start from instead of random weights
-#   EXTRA (pack): files and folders that the records need; RECORDS_ARGS names them as @extra/NAME
+#   EXTRA (pack): files and folders that the records need; SHAPE and RECORDS_ARGS name them as @extra/NAME
 set -euo pipefail
 here=$(cd "$(dirname "$0")" && pwd)
 
@@ -63,11 +63,11 @@ run() {
         tar -C "$pack" -xJf "${1:-$here/out/pack.tar.xz}"
     fi
     local threads=${THREADS:-$(nproc)} gpus=${GPUS:-$(nvidia-smi -L 2>/dev/null | grep -c ^GPU || true)}
-    local extra=${RECORDS_ARGS:-} held=${HELD_FRAMES:-256}
-    extra=${extra//@extra/$pack/extra}
+    local held=${HELD_FRAMES:-256} shape=${SHAPE:-small} extra=${RECORDS_ARGS:-}
+    shape=${shape//@extra/$pack/extra} extra=${extra//@extra/$pack/extra}
     echo "$(nproc) cores, $gpus GPUs, $($python -c 'import torch; print("PyTorch", torch.__version__)'), $work: $(df -h --output=avail "$work" | tail -n 1) free"
 
-    local records=("$pack/bin/records" --shape "${SHAPE:-small}" --size "${SIZE:-384x288}" --prompt "${PROMPT:-512}"
+    local records=("$pack/bin/records" --shape "$shape" --size "${SIZE:-384x288}" --prompt "${PROMPT:-512}"
         --questions "${QUESTIONS:-128}" --points "${POINTS:-40,1500}" --shard "${SHARD:-64}" --seed "${SEED:-7}"
         --threads "$threads")
     read -r -a extra <<<"$extra"
@@ -88,10 +88,10 @@ run() {
     export PYTHONPATH=$pack OMP_NUM_THREADS=${OMP_NUM_THREADS:-4} TORCHINDUCTOR_CACHE_DIR=$work/inductor PYTHONUNBUFFERED=1
     # The trainer itself ends in time; a signal makes it save and end, should it be late.
     # shellcheck disable=SC2086
-    timeout --kill-after=6 --signal=TERM $((end - $(date +%s) - 8)) "${launch[@]}" --records "$work/train" --init "$init" \
+    timeout --kill-after=5 --signal=TERM $((end - $(date +%s) - 10)) "${launch[@]}" --records "$work/train" --init "$init" \
         --out "$work/out" --held-out "$work/held/100" "$work/held/500" --pictures "$work/pictures" --follow \
         --wait-frames "${WAIT_FRAMES:-1024}" --batch "${BATCH:-64}" --rate "${RATE:-1.5e-3}" --seed "${SEED:-7}" \
-        --until $((end - 12)) ${TRAIN_ARGS:-} || echo "the trainer ended with $?"
+        --until $((end - 15)) ${TRAIN_ARGS:-} || echo "the trainer ended with $?"
     echo "$(($(date +%s) - begin)) s of ${SECONDS_TOTAL:-600}"
 }
 

@@ -1,43 +1,37 @@
 //! The one function that users call: an RGB frame and sparse depth in, dense depth out.
 
+mod alignment;
+mod belief;
 mod options;
 mod questions;
+mod stages;
 
-pub use options::{CancelToken, CompleteOptions, Preserve, Progress, ProgressCallback};
+pub use options::{CancelToken, CompleteOptions, Outliers, Preserve, Progress, ProgressCallback};
+pub use stages::StageSeconds;
 
+use crate::depth::outliers::Outlier;
 use crate::depth::{DepthMap, SparseDepth};
 use crate::error::{Error, Result};
 use crate::model::SdimModel;
 use crate::vlm::checkpoint::LoadOptions;
 use crate::vlm::qwen2_5::preprocess::MAX_RATIO;
+use belief::believe;
 use image::RgbImage;
 use questions::Questions;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
 
-/// Seconds spent in each stage.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub struct StageSeconds {
-    /// Preprocessing, fusion and vision encoder.
-    pub encode: f64,
-    /// Reading the shared prefix.
-    pub prefill: f64,
-    /// Asking.
-    pub queries: f64,
-    /// Alignment and filling.
-    pub refine: f64,
-    /// All of it.
-    pub total: f64,
-}
-
 /// A dense map with what it took.
 #[derive(Debug, Clone)]
 pub struct Completion {
     /// The result.
     pub map: DepthMap,
-    /// Pixels asked, those for alignment included.
+    /// Pixels asked, those for alignment and about doubtful measurements included.
     pub asked: usize,
+    /// Measurements that are not believed, row by row. They are not told to the model, do not define its unit, and take no
+    /// part in hints, alignment and filling; what is expected there is what the map would hold without them.
+    pub flagged: Vec<Outlier>,
     /// Time per stage.
     pub seconds: StageSeconds,
 }
@@ -133,28 +127,19 @@ impl DepthCompleter {
         }
         let mut seconds = StageSeconds::default();
         let _span = tracing::info_span!("complete", width = size.0, height = size.1).entered();
-        let span = tracing::info_span!("encode").entered();
-        let (pixels, scattered) = self.model.preprocess(rgb, sparse)?;
-        let encoded = self.model.encode_frame(rgb, &pixels, &scattered)?;
-        drop(span);
-        seconds.encode = start.elapsed().as_secs_f64();
-        let span = tracing::info_span!("prefill").entered();
-        let mark = Instant::now();
-        let prefix = self.model.prefill_encoded(&pixels, encoded, sparse)?;
-        drop(span);
-        seconds.prefill = mark.elapsed().as_secs_f64();
+        let believed = believe(&self.model, rgb, sparse, options, &mut seconds)?;
         let span = tracing::info_span!("queries").entered();
         let mark = Instant::now();
-        let questions = Questions::new(&self.model, &prefix, sparse, options)?;
-        let (answers, residual) = questions.ask_all()?;
+        let questions = Questions::new(&self.model, &believed.prefix, &believed.sparse, options)?;
+        let answers = questions.ask_all()?;
         drop(span);
         seconds.queries = mark.elapsed().as_secs_f64();
         let _refine = tracing::info_span!("refine").entered();
         let mark = Instant::now();
-        let asked = answers.len() + residual.points.len();
-        let map = questions.dense(rgb, answers, &residual)?;
+        let asked = answers.asked + believed.asked;
+        let (map, flagged) = questions.dense(rgb, answers, &believed.flagged)?;
         seconds.refine = mark.elapsed().as_secs_f64();
         seconds.total = start.elapsed().as_secs_f64();
-        Ok(Completion { map, asked, seconds })
+        Ok(Completion { map, asked, flagged, seconds })
     }
 }

@@ -16,6 +16,19 @@ pub enum Preserve {
     Ask,
 }
 
+/// What becomes of measurements that their neighbours, the picture and the model's own answer contradict
+/// ([`crate::Completion::flagged`]): saturated pixels, rays that went astray, left-overs of rectification.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Outliers {
+    /// Their pixels are completed as if nothing had been measured there.
+    #[default]
+    Ignore,
+    /// As `Ignore`, but the map keeps their measurement, where it keeps measurements at all ([`Preserve::Keep`]).
+    Preserve,
+    /// Measurements are not checked: all of them count, and none is flagged.
+    Trust,
+}
+
 /// How far a frame is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Progress {
@@ -58,6 +71,8 @@ pub struct CompleteOptions {
     pub plan: QueryPlan,
     /// What becomes of measured pixels.
     pub preserve: Preserve,
+    /// What becomes of measurements that are not plausible.
+    pub outliers: Outliers,
     /// How answers are got; `None` for the checkpoint's own way (`answer_mode` of `sdim.json`).
     pub answer: Option<AnswerMode>,
     /// Whether to ask at measured pixels too and to spread the difference over the map, so that it passes through the
@@ -79,6 +94,7 @@ impl Default for CompleteOptions {
         Self {
             plan: QueryPlan::default(),
             preserve: Preserve::default(),
+            outliers: Outliers::default(),
             answer: None,
             align: true,
             max_memory: None,
@@ -94,6 +110,7 @@ impl std::fmt::Debug for CompleteOptions {
         f.debug_struct("CompleteOptions")
             .field("plan", &self.plan)
             .field("preserve", &self.preserve)
+            .field("outliers", &self.outliers)
             .field("answer", &self.answer)
             .field("align", &self.align)
             .field("max_memory", &self.max_memory)
@@ -111,6 +128,12 @@ impl CompleteOptions {
     /// With measured pixels kept or asked.
     pub fn with_preserve(mut self, preserve: Preserve) -> Self {
         self.preserve = preserve;
+        self
+    }
+
+    /// With measurements that are not plausible left out, kept in the map or trusted.
+    pub fn with_outliers(mut self, outliers: Outliers) -> Self {
+        self.outliers = outliers;
         self
     }
 

@@ -1,9 +1,10 @@
 //! The questions about one frame: which pixels are asked, the alignment of their answers to the measurements, and the dense
 //! map that comes of both.
 
-use super::options::{CancelToken, CompleteOptions, Preserve, Progress};
-use crate::depth::interpolate::Interpolator;
-use crate::depth::{DepthMap, SparseDepth};
+use super::alignment::{Alignment, Anchors};
+use super::options::{CancelToken, CompleteOptions, Outliers, Preserve, Progress};
+use crate::depth::outliers::Outlier;
+use crate::depth::{DepthMap, SparseDepth, interpolate};
 use crate::error::Result;
 use crate::model::{AskOptions, Prefix, SdimModel, ask};
 use crate::query::plan::{Asked, lattice, refine_pixels, stride_within};
@@ -15,15 +16,14 @@ use image::RgbImage;
 /// Measurements asked for the alignment, at most; more are chosen spatially even.
 const ALIGN_POINTS: usize = 2048;
 
-/// A pixel and what was answered there.
-pub(super) type PixelReading = ((usize, usize), Reading);
-
-/// Measurement minus answer at the pixels that were asked for the alignment.
-#[derive(Default)]
-pub(super) struct Residual {
-    /// Columns and rows.
-    pub(super) points: Vec<(f32, f32)>,
-    values: Vec<f32>,
+/// What was answered in a frame.
+pub(super) struct Answers {
+    /// The plan's pixels.
+    readings: Vec<((usize, usize), Reading)>,
+    /// Measured pixels that were asked for the alignment.
+    anchors: Anchors,
+    /// Pixels asked, those for the alignment included.
+    pub(super) asked: usize,
 }
 
 /// The questions about one frame.
@@ -44,7 +44,7 @@ impl<'a> Questions<'a> {
         options: &'a CompleteOptions,
     ) -> Result<Self> {
         let hint = match model.prompts.settings().hint {
-            Hint::Linear => crate::depth::interpolate::linear(sparse)?,
+            Hint::Linear => interpolate::linear(sparse)?,
             Hint::None => Vec::new(),
         };
         Ok(Self { model, prefix, sparse, options, hint })
@@ -56,10 +56,15 @@ impl<'a> Questions<'a> {
         Query { x, y, measured: self.sparse.get(x, y).filter(|_| tell), hint }
     }
 
-    /// Pixels of a plan that need an answer: measured ones do not, where they are kept.
-    fn wanted(&self, pixels: Vec<(usize, usize)>) -> Vec<(usize, usize)> {
-        let keep = self.options.preserve == Preserve::Keep;
-        pixels.into_iter().filter(|&(x, y)| !keep || self.sparse.get(x, y).is_none()).collect()
+    /// Whether a pixel of a plan needs an answer: measured ones do not, where they are kept.
+    fn wanted(&self, (x, y): (usize, usize)) -> bool {
+        self.options.preserve != Preserve::Keep || self.sparse.get(x, y).is_none()
+    }
+
+    /// Whether a pixel's own question states its measurement, so that the answer repeats it: what was answered at the pixels
+    /// of the alignment, which are not told theirs, says nothing about it.
+    fn told(&self, pixel: (usize, usize)) -> bool {
+        self.model.prompts.states_measurement(&self.query(pixel, true))
     }
 
     fn ask(
@@ -82,20 +87,23 @@ impl<'a> Questions<'a> {
     }
 
     /// Asks the plan's pixels and those of the alignment.
-    pub(super) fn ask_all(&self) -> Result<(Vec<PixelReading>, Residual)> {
+    pub(super) fn ask_all(&self) -> Result<Answers> {
         let (width, height) = (self.sparse.width(), self.sparse.height());
-        let (first, stride, budget) = match self.options.plan {
-            QueryPlan::Every => (lattice(width, height, 1), 1, 0),
-            QueryPlan::Stride(n) => (lattice(width, height, n), n, 0),
-            QueryPlan::Budget(n) => {
-                let n = n.min(width * height);
-                let stride = stride_within(width, height, n.div_ceil(2));
-                let first = lattice(width, height, stride);
-                let rest = n.saturating_sub(first.len());
-                (first, stride, rest)
-            }
+        let stride = match self.options.plan {
+            QueryPlan::Every => 1,
+            QueryPlan::Stride(n) => n,
+            QueryPlan::Budget(n) => stride_within(width, height, n.min(width * height).div_ceil(2)),
         };
-        let coarse = self.wanted(first.clone());
+        let first = lattice(width, height, stride);
+        let coarse: Vec<_> = first.iter().copied().filter(|&p| self.wanted(p)).collect();
+        let all = match self.options.preserve {
+            Preserve::Keep => width * height - self.sparse.measured(),
+            Preserve::Ask => width * height,
+        };
+        let budget = match self.options.plan {
+            QueryPlan::Budget(n) => n.min(all).saturating_sub(coarse.len()),
+            QueryPlan::Every | QueryPlan::Stride(_) => 0,
+        };
         let anchors = match self.options.align && coarse.len() + budget > 0 {
             true => choose_evenly(self.sparse, ALIGN_POINTS, 0),
             false => Vec::new(),
@@ -112,14 +120,12 @@ impl<'a> Questions<'a> {
         let anchor_pixels: Vec<(usize, usize)> = anchors.iter().map(|a| (a.0, a.1)).collect();
         // An answer that was told its measurement would only repeat it.
         let said = self.ask(&anchor_pixels, false, pixels.len(), pixels.len() + anchors.len())?;
-        let mut residual = Residual::default();
-        for ((x, y, measured), reading) in anchors.into_iter().zip(said) {
-            if reading.value.is_finite() {
-                residual.points.push((x as f32, y as f32));
-                residual.values.push(measured - reading.value);
-            }
+        let asked = pixels.len() + said.len();
+        let mut beside = Anchors::default();
+        for (anchor, reading) in anchors.into_iter().zip(&said) {
+            beside.push(anchor, reading);
         }
-        Ok((pixels.into_iter().zip(readings).collect(), residual))
+        Ok(Answers { readings: pixels.into_iter().zip(readings).collect(), anchors: beside, asked })
     }
 
     /// Where the rest of a budget goes.
@@ -141,44 +147,51 @@ impl<'a> Questions<'a> {
             })
             .collect();
         let (width, height) = (self.sparse.width(), self.sparse.height());
-        self.wanted(refine_pixels(width, height, stride, &answers, budget))
+        refine_pixels(width, height, stride, &answers, budget, |x, y| self.wanted((x, y)))
     }
 
-    /// Aligns the answers, fills the rest, keeps the measurements.
+    /// Aligns the answers, fills the rest, keeps the measurements; and says what is expected at the flagged ones, which are kept
+    /// where the caller insists.
     pub(super) fn dense(
         &self,
         rgb: &RgbImage,
-        answers: Vec<PixelReading>,
-        residual: &Residual,
-    ) -> Result<DepthMap> {
+        answers: Answers,
+        flagged: &[(usize, usize, f32)],
+    ) -> Result<(DepthMap, Vec<Outlier>)> {
         let (width, height) = (self.sparse.width(), self.sparse.height());
-        let shift = if residual.points.is_empty() {
-            None
-        } else {
-            Some(Interpolator::new(&residual.points, width, height)?.raster(&residual.values))
-        };
-        let asked: Vec<Answered> = answers
+        let alignment = Alignment::new(answers.anchors, width, height)?;
+        let asked: Vec<Answered> = (answers.readings)
             .into_iter()
-            .filter_map(|((x, y), r)| {
-                let moved = r.value + shift.as_ref().map_or(0.0, |s| s[y * width + x]);
-                // An alignment that would turn the depth around is not trusted.
-                let depth = if moved > 0.0 { moved } else { r.value };
-                (depth.is_finite() && depth > 0.0).then_some(Answered {
+            .filter(|(_, answer)| answer.value.is_finite() && answer.value > 0.0)
+            .map(|((x, y), answer)| {
+                let aligned = match &alignment {
+                    Some(alignment) if !self.told((x, y)) => alignment.apply((x, y), answer),
+                    _ => answer,
+                };
+                Answered {
                     x,
                     y,
-                    depth,
-                    confidence: r.confidence,
-                    expected_error: r.expected_error,
-                })
+                    depth: aligned.value,
+                    confidence: aligned.confidence,
+                    expected_error: aligned.expected_error,
+                }
             })
             .collect();
         let none = SparseDepth::from_points(width, height, &[])?;
         let kept = if self.options.preserve == Preserve::Keep { self.sparse } else { &none };
         let input = FillInput { width, height, rgb, asked: &asked, sparse: kept };
         let mut filled = self.options.fill.fill(&input)?;
+        let expected = |&(x, y, measured): &(usize, usize, f32)| Outlier {
+            x,
+            y,
+            measured,
+            expected: filled.depth[y * width + x],
+        };
+        let outliers = flagged.iter().map(expected).collect();
+        let insisted = if self.options.outliers == Outliers::Preserve { flagged } else { &[] };
         let mut measured = vec![false; width * height];
         if self.options.preserve == Preserve::Keep {
-            for (x, y, depth) in self.sparse.points() {
+            for (x, y, depth) in self.sparse.points().chain(insisted.iter().copied()) {
                 let i = y * width + x;
                 measured[i] = true;
                 filled.depth[i] = depth;
@@ -186,6 +199,8 @@ impl<'a> Questions<'a> {
                 filled.expected_error[i] = 0.0;
             }
         }
-        DepthMap::new(width, height, filled.depth, filled.confidence, filled.expected_error, measured)
+        let map =
+            DepthMap::new(width, height, filled.depth, filled.confidence, filled.expected_error, measured)?;
+        Ok((map, outliers))
     }
 }

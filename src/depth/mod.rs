@@ -7,6 +7,7 @@ mod camera;
 pub mod interpolate;
 pub mod io;
 mod map;
+pub mod outliers;
 pub(crate) mod pixels;
 pub(crate) mod sampling;
 mod scale;

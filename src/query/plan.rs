@@ -79,48 +79,73 @@ pub struct Asked {
 }
 
 /// Where to spend the rest of a budget: the lattice cells whose corners disagree most, relative to their depth, or are
-/// least sure. Each chosen cell gives its centre and its edge midpoints. At most `budget` pixels, none of them asked before.
+/// least sure. Each chosen cell gives its centre and its edge midpoints; when all cells have given theirs, each gives the rest of
+/// its pixels, in the same order. Only pixels that are `wanted` and not on the lattice are chosen: `budget` of them, or all
+/// if there are fewer.
+///
+/// A corner without a readable answer is as unsure as a corner can be: its depth may be off by all of it.
 pub fn refine_pixels(
     width: usize,
     height: usize,
     stride: usize,
     answers: &[Asked],
     budget: usize,
+    wanted: impl Fn(usize, usize) -> bool,
 ) -> Vec<(usize, usize)> {
     let pixels = lattice(width, height, stride);
-    let cols = pixels.iter().take_while(|p| p.1 == pixels[0].1).count();
-    let rows = pixels.len() / cols.max(1);
     if stride < 2 || answers.len() != pixels.len() {
         return Vec::new();
     }
-    let mut cells: Vec<(f32, usize, usize)> = Vec::new();
+    let cols = pixels.iter().take_while(|p| p.1 == pixels[0].1).count();
+    let rows = pixels.len() / cols;
+    let mut cells: Vec<(f32, usize, usize)> = Vec::with_capacity(pixels.len());
     for r in 0..rows {
         for c in 0..cols {
             let corners = [(r, c), (r, c + 1), (r + 1, c), (r + 1, c + 1)];
             let inside = corners.iter().filter(|(r, c)| *r < rows && *c < cols);
-            let values: Vec<Asked> = inside.map(|(r, c)| answers[r * cols + c]).collect();
-            let depths = || values.iter().map(|a| a.depth).filter(|d| d.is_finite());
-            let (low, high) = depths().fold((f32::MAX, 0f32), |(l, h), d| (l.min(d), h.max(d)));
-            let unsure = values.iter().map(|a| a.expected_error).fold(0f32, f32::max);
-            let score = if low < high { (high - low + unsure) / high } else { unsure / high.max(1e-6) };
-            cells.push((score, r, c));
+            cells.push((doubt(inside.map(|(r, c)| &answers[r * cols + c])), r, c));
         }
     }
     cells.sort_by(|a, b| b.0.total_cmp(&a.0));
     let half = stride / 2;
-    let mut out = Vec::with_capacity(budget);
-    for (_, r, c) in cells {
+    let middle = cells.iter().flat_map(|&(_, r, c)| {
         let (x, y) = pixels[r * cols + c];
-        for (x, y) in [(x + half, y + half), (x + half, y), (x, y + half)] {
-            if out.len() == budget {
-                return out;
-            }
-            if x < width && y < height {
-                out.push((x, y));
-            }
+        [(x + half, y + half), (x + half, y), (x, y + half)]
+    });
+    let mut taken = vec![false; width * height];
+    pixels.iter().for_each(|&(x, y)| taken[y * width + x] = true);
+    let first = pixels[0];
+    let rest = cells.iter().flat_map(|&(_, r, c)| {
+        // The cells at the left and the upper border hold what lies before them.
+        let span = |at: usize, cell: usize, first: usize| {
+            if cell == 0 { 0..first + stride } else { at..at + stride }
+        };
+        let (x, y) = pixels[r * cols + c];
+        let columns = span(x, c, first.0);
+        span(y, r, first.1).flat_map(move |y| columns.clone().map(move |x| (x, y)))
+    });
+    let fresh = |&(x, y): &(usize, usize)| {
+        x < width && y < height && wanted(x, y) && !std::mem::replace(&mut taken[y * width + x], true)
+    };
+    middle.chain(rest).filter(fresh).take(budget).collect()
+}
+
+/// How much the corners of a cell disagree and doubt, relative to their depth.
+fn doubt<'a>(corners: impl Iterator<Item = &'a Asked>) -> f32 {
+    let (mut low, mut high, mut unsure, mut unreadable) = (f32::MAX, 0f32, 0f32, false);
+    for corner in corners {
+        if corner.depth.is_finite() {
+            (low, high) = (low.min(corner.depth), high.max(corner.depth));
+            unsure = unsure.max(corner.expected_error);
+        } else {
+            unreadable = true;
         }
     }
-    out
+    if unreadable {
+        unsure = if high > 0.0 { unsure.max(high) } else { 1.0 };
+    }
+    let apart = if low < high { high - low } else { 0.0 };
+    if high > 0.0 { (apart + unsure) / high } else { unsure }
 }
 
 #[cfg(test)]
@@ -156,11 +181,48 @@ mod tests {
         let n = lattice(w, h, s).len();
         let answers: Vec<Asked> =
             (0..n).map(|i| Asked { depth: if i % 4 < 2 { 1.0 } else { 3.0 }, expected_error: 0.0 }).collect();
-        let chosen = refine_pixels(w, h, s, &answers, 6);
+        let chosen = refine_pixels(w, h, s, &answers, 6, |_, _| true);
         assert_eq!(chosen.len(), 6);
         let asked = lattice(w, h, s);
         assert!(chosen.iter().all(|p| !asked.contains(p)));
         let between = asked[1].0..asked[2].0 + 1;
         assert!(chosen.iter().all(|(x, _)| between.contains(x)), "{chosen:?}");
+    }
+    #[test]
+    fn cells_with_unreadable_corners_come_first() {
+        let (w, h, s) = (32, 32, 4);
+        let asked = lattice(w, h, s);
+        let unreadable = asked[3 * 8 + 5];
+        let answers: Vec<Asked> = (0..asked.len())
+            .map(|i| match asked[i] == unreadable {
+                true => Asked { depth: f32::NAN, expected_error: f32::NAN },
+                // A step and some doubt elsewhere.
+                false => Asked { depth: if i % 8 < 2 { 1.0 } else { 2.0 }, expected_error: 0.1 },
+            })
+            .collect();
+        // The four cells around it, three pixels each.
+        let chosen = refine_pixels(w, h, s, &answers, 12, |_, _| true);
+        let near = |a: usize, b: usize| a.abs_diff(b) <= s;
+        assert!(chosen.iter().all(|p| near(p.0, unreadable.0) && near(p.1, unreadable.1)), "{chosen:?}");
+        let silent = vec![Asked { depth: f32::NAN, expected_error: f32::NAN }; asked.len()];
+        assert_eq!(refine_pixels(w, h, s, &silent, 12, |_, _| true).len(), 12);
+    }
+
+    #[test]
+    fn a_budget_is_spent_on_wanted_pixels_alone_and_to_the_end() {
+        for (w, h, s) in [(37, 22, 3), (64, 48, 5), (9, 30, 8), (5, 5, 7), (40, 1, 2)] {
+            let asked = lattice(w, h, s);
+            let answers: Vec<Asked> = (0..asked.len())
+                .map(|i| Asked { depth: 1.0 + (i * 7 % 5) as f32, expected_error: 0.1 })
+                .collect();
+            let wanted = |x: usize, y: usize| (x * 5 + y * 3) % 4 != 0;
+            let all = refine_pixels(w, h, s, &answers, usize::MAX, wanted);
+            let left = (0..w * h).map(|i| (i % w, i / w)).filter(|p| wanted(p.0, p.1) && !asked.contains(p));
+            let mut sorted = all.clone();
+            sorted.sort_by_key(|p| (p.1, p.0));
+            assert_eq!(sorted, left.collect::<Vec<_>>(), "{w}x{h}, {s}: each of them once");
+            let some = all.len() / 2;
+            assert_eq!(refine_pixels(w, h, s, &answers, some, wanted), all[..some]);
+        }
     }
 }

@@ -204,6 +204,15 @@ impl PromptWriter {
         &self.settings
     }
 
+    /// Whether the words of a query state its own measurement.
+    pub(crate) fn states_measurement(&self, query: &Query) -> bool {
+        let t = &self.settings.template;
+        self.settings.measurements == MeasurementPrompt::PerQuery
+            && query.measured.is_some()
+            && t.query.contains("{mask}")
+            && t.mask_measured.contains("{x}")
+    }
+
     /// Metres per number unit of a frame.
     pub fn unit(&self, sparse: &SparseDepth) -> f32 {
         self.settings.unit.metres(sparse.max().unwrap_or(1.0))

@@ -6,6 +6,7 @@ use rayon::prelude::*;
 use super::fill::{FillInput, Filled};
 use crate::depth::interpolate::Plane;
 use crate::depth::interpolate::mesh::{Mesh, NONE, Owner};
+use crate::depth::pixels::local_colour;
 use crate::error::Result;
 
 /// Linear within surfaces, and at a depth edge each pixel goes to the side whose colour and place it fits, never between.
@@ -77,7 +78,7 @@ impl<'a> Surfaces<'a> {
             let (depth, confidence, error) =
                 (filled.depth[pixel], filled.confidence[pixel], filled.expected_error[pixel]);
             let value = Value { depth, confidence, error };
-            Site { position: [x as f64, y as f64], colour: guide(input.rgb, x, y), value }
+            Site { position: [x as f64, y as f64], colour: local_colour(input.rgb, x, y), value }
         };
         // Pixels are distinct, so the mesh keeps them all and in this order.
         let sites = pixels.par_iter().map(site).collect();
@@ -191,7 +192,7 @@ impl<'a> Surfaces<'a> {
 
     /// Nearness in colour and in place, scaled so that the best candidate has weight 1.
     fn weights(&self, x: usize, y: usize, candidates: &[usize]) -> [f32; CANDIDATES] {
-        let colour = guide(self.rgb, x, y);
+        let colour = local_colour(self.rgb, x, y);
         let apart = |s: &Site| (s.position[0] - x as f64).powi(2) + (s.position[1] - y as f64).powi(2);
         let mut distances = [f64::INFINITY; CANDIDATES];
         for (distance, &site) in distances.iter_mut().zip(candidates) {
@@ -227,18 +228,4 @@ impl<'a> Surfaces<'a> {
             error: mean(|v| v.error) + elsewhere,
         }
     }
-}
-
-/// Colour of a pixel, half its own and half that of its four neighbours: less noise, and edges stay in place.
-fn guide(rgb: &RgbImage, x: usize, y: usize) -> [f32; 3] {
-    let (right, bottom) = (rgb.width() as usize - 1, rgb.height() as usize - 1);
-    let pixel = |x: usize, y: usize| rgb.get_pixel(x as u32, y as u32).0.map(f32::from);
-    let around = [
-        pixel(x.saturating_sub(1), y),
-        pixel((x + 1).min(right), y),
-        pixel(x, y.saturating_sub(1)),
-        pixel(x, (y + 1).min(bottom)),
-    ];
-    let own = pixel(x, y);
-    std::array::from_fn(|c| 0.5 * own[c] + 0.125 * around.iter().map(|p| p[c]).sum::<f32>())
 }

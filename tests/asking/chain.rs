@@ -9,7 +9,7 @@ use sdim::internals::vlm::chat::tokenizer::Tokenizer;
 use sdim::settings::{
     AnswerMode, Generation, Marker, MeasurementPrompt, PixelReference, PromptTemplate, Settings,
 };
-use sdim::{CompleteOptions, DepthCompleter, Error, QueryPlan};
+use sdim::{CompleteOptions, DepthCompleter, Error, Preserve, QueryPlan};
 
 /// A model whose next token hangs on the last one alone: after an unmeasured pixel it says `d=4.25m`, where the 4 might
 /// have been a 9, after a measured one `7m`, and then it stops.
@@ -115,6 +115,26 @@ fn a_frame_is_completed_by_every_way_of_asking() {
             assert!((1.0..9.5).contains(&asked), "{asked}");
         }
     }
+}
+
+#[test]
+fn an_answer_that_was_told_its_measurement_is_not_moved() {
+    let completer = DepthCompleter::new(chain(&for_chain(PixelReference::Coordinates)));
+    let (rgb, sparse) = tiny::frame(90, 70);
+    let short = Generation { max_new_tokens: 8, ..Generation::default() };
+    let options = CompleteOptions::default()
+        .with_plan(QueryPlan::Stride(10))
+        .with_preserve(Preserve::Ask)
+        .with_answer(AnswerMode::Generate(short));
+    let map = completer.complete(&rgb, &sparse, &options).unwrap();
+    let asked = sdim::internals::query::plan::lattice(90, 70, 10);
+    let (told, open): (Vec<_>, Vec<_>) = asked.iter().partition(|p| sparse.get(p.0, p.1).is_some());
+    assert!(!told.is_empty());
+    for (x, y) in told {
+        assert!((map.get(x, y).unwrap() - 7.0).abs() < 1e-5, "({x}, {y}): {:?}", map.get(x, y));
+    }
+    let moved = open.iter().filter(|p| (map.get(p.0, p.1).unwrap() - 4.25).abs() > 0.1).count();
+    assert!(moved * 2 > open.len(), "the others are aligned: {moved} of {}", open.len());
 }
 
 #[test]

@@ -2,6 +2,7 @@
 
 import csv
 import shutil
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -97,6 +98,13 @@ def test_a_mirrored_frame_mirrors_all_of_it(tmp_path):
     # Told measurements lie where the fusion block sees them.
     x, y = turned.told_at[0, : turned.told_count[0]].long().unbind(-1)
     assert (turned.depth[0, y, x] > 0).all()
+
+
+def test_what_runs_out_is_said_before_it_does(tmp_path, monkeypatch):
+    trainer, _, _ = trainer_and_batch(tmp_path)
+    assert not dict(checkpoint.shortages(tmp_path, trainer.model, CPU)).get("disk")
+    monkeypatch.setattr(checkpoint.shutil, "disk_usage", lambda _: SimpleNamespace(free=2_000_000))
+    assert "0.00 GB of disk left" in dict(checkpoint.shortages(tmp_path, trainer.model, CPU))["disk"]
 
 
 def test_other_records_are_refused(tmp_path):

@@ -41,7 +41,14 @@ const BANDS: usize = 16;
 
 impl Mesh {
     pub(crate) fn new(points: &[(f32, f32)], width: usize, height: usize) -> Result<Self> {
-        let pixels = pixel_count(width, height)?;
+        let mut mesh = Self::joined(points, width, height)?;
+        mesh.owner = mesh.owners(pixel_count(width, height)?);
+        Ok(mesh)
+    }
+
+    /// The sites and how they are joined, without the owners of pixels: for [`Mesh::neighbours`] alone.
+    pub(crate) fn joined(points: &[(f32, f32)], width: usize, height: usize) -> Result<Self> {
+        pixel_count(width, height)?;
         if points.is_empty() {
             return Err(Error::NoMeasurement { width, height });
         }
@@ -52,10 +59,7 @@ impl Mesh {
         let (triangles, across) = delaunay(&sites);
         let (first, links) =
             if triangles.is_empty() { chain(&sites) } else { neighbours(sites.len(), &triangles, &across) };
-        let mut mesh =
-            Self { width, height, sites, origin, triangles, across, first, links, owner: Vec::new() };
-        mesh.owner = mesh.owners(pixels);
-        Ok(mesh)
+        Ok(Self { width, height, sites, origin, triangles, across, first, links, owner: Vec::new() })
     }
 
     pub(crate) fn owner(&self, x: usize, y: usize) -> Owner {

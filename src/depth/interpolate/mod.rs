@@ -53,23 +53,31 @@ fn from_nearest(
 /// [`Error::NoMeasurement`](crate::error::Error::NoMeasurement) for a map without measurements.
 pub fn linear(sparse: &SparseDepth) -> Result<Vec<f32>> {
     sparse.require_points()?;
-    let (width, height) = (sparse.width(), sparse.height());
-    if sparse.measured() == width * height {
+    let edge = rim(sparse);
+    if edge.is_empty() {
         return Ok(sparse.as_slice().to_vec());
     }
-    // The triangles at a point with eight measured neighbours are the small ones towards them and hold no missing pixel, so
-    // such points can be left out without changing the result. In dense maps this saves nearly all of the work.
-    let at_a_hole = |x, y| faces_a_hole(sparse.as_slice(), width, height, x, y);
-    let edge: Vec<_> = sparse.points().filter(|&(x, y, _)| at_a_hole(x, y)).collect();
     let positions: Vec<_> = edge.iter().map(|&(x, y, _)| (x as f32, y as f32)).collect();
     let values: Vec<_> = edge.iter().map(|&(_, _, depth)| depth).collect();
-    let mut out = Interpolator::new(&positions, width, height)?.raster(&values);
+    let mut out = Interpolator::new(&positions, sparse.width(), sparse.height())?.raster(&values);
     for (pixel, &depth) in out.iter_mut().zip(sparse.as_slice()) {
         if !depth.is_nan() {
             *pixel = depth;
         }
     }
     Ok(out)
+}
+
+/// Measurements with a missing pixel among the eight around them, row by row: none if nothing is missing.
+///
+/// The triangles at any other are the small ones towards its eight neighbours and hold no missing pixel, so it can be left out of
+/// a mesh without changing what that says about missing pixels. In dense maps this saves nearly all of the work.
+pub(crate) fn rim(sparse: &SparseDepth) -> Vec<(usize, usize, f32)> {
+    let (width, height) = (sparse.width(), sparse.height());
+    if sparse.measured() == width * height {
+        return Vec::new();
+    }
+    sparse.points().filter(|&(x, y, _)| faces_a_hole(sparse.as_slice(), width, height, x, y)).collect()
 }
 
 /// No measurement in this column.
@@ -140,7 +148,6 @@ fn nearest_columns(y: usize, found: &[u32]) -> impl Iterator<Item = usize> {
 /// The triangulation, and which triangle holds which pixel, is computed once. Outside the hull of the points, and everywhere
 /// if they lie on one line, the value is that of the nearest point. Of several points at one position the first counts.
 #[derive(Debug)]
-#[doc(hidden)]
 pub struct Interpolator {
     mesh: Mesh,
     points: usize,
@@ -199,6 +206,23 @@ impl Interpolator {
         check_length("raster", out.len(), pixel_count(self.mesh.width, self.mesh.height)?)?;
         self.paint(values, out);
         Ok(())
+    }
+
+    /// The points whose values make the value at a pixel of the frame, with their weights, which sum to 1.
+    pub(crate) fn weights_at(&self, x: usize, y: usize) -> [(usize, f32); 3] {
+        let point = |site: usize| self.mesh.origin[site];
+        match self.mesh.owner(x, y) {
+            Owner::Site(site) => [(point(site), 1.0), (point(site), 0.0), (point(site), 0.0)],
+            Owner::Triangle(triangle) => {
+                let (p, corners) = ([x as f64, y as f64], self.mesh.corners(triangle));
+                let area = cross(corners[0], corners[1], corners[2]);
+                let sites = self.mesh.triangles[triangle];
+                std::array::from_fn(|i| {
+                    let part = cross(corners[(i + 1) % 3], corners[(i + 2) % 3], p) / area;
+                    (point(sites[i] as usize), part.clamp(0.0, 1.0) as f32)
+                })
+            }
+        }
     }
 
     fn paint(&self, values: &[f32], out: &mut [f32]) {

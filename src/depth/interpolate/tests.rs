@@ -110,6 +110,21 @@ fn at_agrees_with_raster() {
 }
 
 #[test]
+fn weights_give_the_value() {
+    let sparse = scattered(12, 60, 50, 40);
+    let points: Vec<_> = sparse.points().map(|(x, y, _)| (x as f32, y as f32)).collect();
+    let values: Vec<_> = sparse.points().map(|p| p.2).collect();
+    let mesh = Interpolator::new(&points, 50, 40).unwrap();
+    let raster = mesh.raster(&values);
+    for (i, &expected) in raster.iter().enumerate() {
+        let weights = mesh.weights_at(i % 50, i / 50);
+        let sum: f32 = weights.iter().map(|w| w.1).sum();
+        let found: f32 = weights.iter().map(|&(point, w)| w * values[point]).sum();
+        assert!((sum - 1.0).abs() < 1e-5 && (found - expected).abs() < 1e-4, "pixel {i}: {weights:?}");
+    }
+}
+
+#[test]
 fn no_value_leaves_the_range_and_points_are_kept() {
     for (seed, count) in [(21, 5), (22, 100), (23, 1500), (24, 4000)] {
         let sparse = scattered(seed, count, 80, 60);

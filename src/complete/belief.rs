@@ -1,0 +1,137 @@
+//! Which measurements a frame is completed from.
+
+use super::options::{CancelToken, CompleteOptions, Outliers};
+use super::stages::StageSeconds;
+use crate::depth::outliers::{Contradiction, contradictions, without};
+use crate::depth::{SparseDepth, interpolate};
+use crate::error::Result;
+use crate::model::{AskOptions, Prefix, SdimModel, ask};
+use crate::query::{Hint, Query, Reading};
+
+use image::RgbImage;
+use std::borrow::Cow;
+use std::time::Instant;
+
+/// How far a measurement lies from the model's answer, in log depth, when that contradicts it: 28 %, and this many times the answer's
+/// expected error. Measured on 180 procedural frames with 100 measurements, 5 % of them wrong by 1.5 to 3 times: with the
+/// neighbours' contradiction, 80 % of the wrong ones and 0.7 % of the right ones; neighbours alone at 0.7 %: 73 %.
+const APART: f32 = 0.25;
+const PER_ERROR: f32 = 2.0;
+
+/// A frame's measurements after the check.
+pub(super) struct Believed<'a> {
+    /// Those that are told, hinted, aligned to and kept.
+    pub(super) sparse: Cow<'a, SparseDepth>,
+    /// The others: column, row, metres.
+    pub(super) flagged: Vec<(usize, usize, f32)>,
+    /// What all queries share, read with these measurements.
+    pub(super) prefix: Prefix,
+    /// Pixels asked for the check.
+    pub(super) asked: usize,
+}
+
+/// Checks the measurements and reads the frame with those that are believed.
+///
+/// Where the neighbours of a contradicted measurement lie far off, the model is asked about it, with all contradicted ones
+/// taken away; the frame is read again if it believes one.
+pub(super) fn believe<'a>(
+    model: &SdimModel,
+    rgb: &RgbImage,
+    sparse: &'a SparseDepth,
+    options: &CompleteOptions,
+    seconds: &mut StageSeconds,
+) -> Result<Believed<'a>> {
+    let mark = Instant::now();
+    let found = match options.outliers {
+        Outliers::Trust => Vec::new(),
+        Outliers::Ignore | Outliers::Preserve => contradictions(rgb, sparse)?,
+    };
+    seconds.check = mark.elapsed().as_secs_f64();
+    if found.is_empty() {
+        let prefix = prefill(model, rgb, sparse, seconds)?;
+        return Ok(Believed { sparse: Cow::Borrowed(sparse), flagged: Vec::new(), prefix, asked: 0 });
+    }
+    let pixels: Vec<usize> = found.iter().map(|c| c.pixel).collect();
+    let rest = without(sparse, &pixels)?;
+    let prefix = prefill(model, rgb, &rest, seconds)?;
+    let mark = Instant::now();
+    let doubtful: Vec<Contradiction> = found.iter().filter(|c| !c.certain).copied().collect();
+    let answers = answers_about(model, &doubtful, sparse, &rest, &prefix, options)?;
+    let mut refuted: Vec<usize> = found.iter().filter(|c| c.certain).map(|c| c.pixel).collect();
+    let verdicts = doubtful.iter().zip(&answers);
+    refuted.extend(verdicts.filter(|(c, a)| refutes(c, sparse.as_slice()[c.pixel], a)).map(|(c, _)| c.pixel));
+    refuted.sort_unstable();
+    seconds.check += mark.elapsed().as_secs_f64();
+    let (width, asked) = (sparse.width(), doubtful.len());
+    let flagged = refuted.iter().map(|&p| (p % width, p / width, sparse.as_slice()[p])).collect::<Vec<_>>();
+    if refuted.len() == found.len() {
+        return Ok(Believed { sparse: Cow::Owned(rest), flagged, prefix, asked });
+    }
+    let sparse = match refuted.is_empty() {
+        true => Cow::Borrowed(sparse),
+        false => Cow::Owned(without(sparse, &refuted)?),
+    };
+    let prefix = prefill(model, rgb, &sparse, seconds)?;
+    Ok(Believed { sparse, flagged, prefix, asked })
+}
+
+fn answers_about(
+    model: &SdimModel,
+    doubtful: &[Contradiction],
+    sparse: &SparseDepth,
+    rest: &SparseDepth,
+    prefix: &Prefix,
+    options: &CompleteOptions,
+) -> Result<Vec<Reading>> {
+    if doubtful.is_empty() {
+        return Ok(Vec::new());
+    }
+    let settings = model.prompts.settings();
+    let hints = match settings.hint {
+        Hint::Linear => interpolate::linear(rest)?,
+        Hint::None => Vec::new(),
+    };
+    let query = |c: &Contradiction| {
+        let hint = hints.get(c.pixel).copied().unwrap_or(f32::NAN);
+        Query { x: c.pixel % sparse.width(), y: c.pixel / sparse.width(), measured: None, hint }
+    };
+    let queries: Vec<Query> = doubtful.iter().map(query).collect();
+    let mut progress = |_: usize| !options.cancel.as_ref().is_some_and(CancelToken::is_cancelled);
+    let options = AskOptions {
+        mode: options.answer.as_ref(),
+        max_memory: options.max_memory,
+        progress: Some(&mut progress),
+    };
+    ask(model, prefix, &queries, options)
+}
+
+/// Encodes a frame and reads what its queries share.
+fn prefill(
+    model: &SdimModel,
+    rgb: &RgbImage,
+    sparse: &SparseDepth,
+    seconds: &mut StageSeconds,
+) -> Result<Prefix> {
+    let span = tracing::info_span!("encode").entered();
+    let mark = Instant::now();
+    let (pixels, scattered) = model.preprocess(rgb, sparse)?;
+    let encoded = model.encode_frame(rgb, &pixels, &scattered)?;
+    drop(span);
+    seconds.encode += mark.elapsed().as_secs_f64();
+    let _span = tracing::info_span!("prefill").entered();
+    let mark = Instant::now();
+    let prefix = model.prefill_encoded(&pixels, encoded, sparse)?;
+    seconds.prefill += mark.elapsed().as_secs_f64();
+    Ok(prefix)
+}
+
+/// Whether the model's answer contradicts a measurement on the side on which the neighbours do. An answer that cannot be read
+/// leaves it to them.
+fn refutes(contradiction: &Contradiction, measured: f32, answer: &Reading) -> bool {
+    if !(answer.value.is_finite() && answer.value > 0.0) {
+        return contradiction.stands_alone();
+    }
+    let apart = (measured / answer.value).ln();
+    let apart = if contradiction.behind { apart } else { -apart };
+    apart > APART + PER_ERROR * answer.expected_error / answer.value
+}
