@@ -1,7 +1,7 @@
 //! What the multipliers of this machine can do when nothing has to come from memory.
 
 use super::gemm::packed::WeightFormat;
-use super::isa::{Level, Portable, call_compiled};
+use super::isa::{Level, Portable};
 use super::simd::{Simd, Vector};
 use rayon::prelude::*;
 use std::time::Instant;
@@ -27,10 +27,12 @@ pub fn peak_gflops(format: WeightFormat) -> f64 {
 
 /// Runs the loop of the fastest instruction for a format; gives the number of operations.
 fn once(format: WeightFormat) -> usize {
+    // Portable code widens every format.
+    let _ = format;
     match Level::current() {
         Level::Portable => f32_products(Portable),
         #[cfg(target_arch = "x86_64")]
-        Level::Avx2(isa) => call_compiled!(Avx2, isa, f32_products, () -> usize),
+        Level::Avx2(isa) => x86_64::avx2(isa),
         #[cfg(target_arch = "x86_64")]
         Level::Avx512(isa) => x86_64::avx512(isa, format),
         #[cfg(target_arch = "x86_64")]
@@ -114,9 +116,13 @@ mod aarch64 {
 mod x86_64 {
     use super::{STEPS, SUMS, WeightFormat, f32_products};
     use crate::kernels::isa::{
-        Amx, AmxUnit, Avx512, Avx512Bf16, Avx512Vnni, TILE_SIDE, TileUnit, call_compiled,
+        Amx, AmxUnit, Avx2, Avx512, Avx512Bf16, Avx512Vnni, TILE_SIDE, TileUnit, call_compiled,
     };
     use std::arch::x86_64::*;
+
+    pub(super) fn avx2(isa: Avx2) -> usize {
+        call_compiled!(Avx2, isa, f32_products, () -> usize)
+    }
 
     pub(super) fn avx512(isa: Avx512, format: WeightFormat) -> usize {
         match (format, Avx512Bf16::detect(), Avx512Vnni::detect()) {

@@ -2,7 +2,7 @@
 
 use super::plan::KeySet;
 
-/// Query, key and value rows, and the extra pair's.
+/// Query rows, own key and value rows, and the keys and values of [`SharedKeys`](super::SharedKeys), which the code calls the extra pair.
 #[derive(Clone, Copy)]
 pub(super) struct Inputs<'a> {
     pub(super) q: &'a [f32],

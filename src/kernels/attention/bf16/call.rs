@@ -137,7 +137,7 @@ impl Call<'_> {
         self.layout.heads / self.layout.kv_heads
     }
 
-    /// Some rows of a tile, which are its query rows times heads of the group, for one key head. `out` is the tile's.
+    /// Some rows of a tile for one key head; a row is a query row with one head of the group. `out` is the tile's.
     fn step(
         &self,
         s: &mut StepBuffers,
@@ -148,7 +148,7 @@ impl Call<'_> {
     ) {
         let AttentionLayout { heads, kv_heads, head_dim: hd, .. } = *self.layout;
         let (group, plan) = (self.group(), &self.plan.tiles[tile]);
-        // Of a row: where it lies among the tile's, in elements.
+        // Where a row's elements lie among the tile's.
         let place = |r: usize| (r / group * heads + head * group + r % group) * hd;
         s.seen[0].clear();
         s.seen[0].resize(rows.len(), self.plan.blocks[tile].shared.len());

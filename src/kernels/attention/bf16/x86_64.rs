@@ -155,14 +155,15 @@ impl HalfPanels for Bf16Dot {
     }
 }
 
-/// Where the matrices of a call lie in its buffer, in words.
+/// Where the matrices of a call lie in the workspace, in words: rows of queries, scores, weights and sums, one after the other.
 struct WorkspaceLayout {
     rows: usize,
     /// Panels of keys of each part that some row sees.
     panels: [usize; MAX_KEY_PARTS],
-    /// Words multiplied of a query row, and from row to row.
+    /// Words of a converted query row, all of which are multiplied.
     steps: usize,
-    /// From row to row of the probabilities: an odd number of cache lines, so that rows do not compete for the same sets.
+    /// Words from one row of weights to the next: an odd number of cache lines, so that rows do not compete for the same sets of the
+    /// cache.
     stride: usize,
     scores: usize,
     weights: usize,
@@ -256,7 +257,7 @@ fn attend_rows<P: PanelProducts>(
     }
 }
 
-/// That all operands are there.
+/// Checks that all operands are there.
 #[inline(always)]
 fn check<M: MicroKernel>(job: &QueryRows<'_>, shape: &WorkspaceLayout) {
     let (rows, hd) = (shape.rows, job.head_dim);
@@ -283,7 +284,7 @@ unsafe fn softmax_of_row(
     ready: Option<&mut [f32]>,
     weights: &mut [u32],
 ) -> f32 {
-    // From panel to panel.
+    // From a row of scores of one panel to that of the next.
     let jump = shape.rows * PANEL_WIDTH;
     let scores = scores.as_mut_ptr().wrapping_add(row * PANEL_WIDTH).cast::<f32>();
     // SAFETY: the token proves that the CPU has the instructions; panels end within the scores and the weights, and a row of
@@ -303,7 +304,7 @@ unsafe fn softmax_of_row(
             }
             for panel in first..first + part.seen[row].div_ceil(PANEL_WIDTH) {
                 for (half, max) in maxima.iter_mut().enumerate() {
-                    // The second operand is taken where the first is NaN.
+                    // This gives its second operand where the first is NaN: the maximum is one of the numbers.
                     *max = _mm512_max_ps(_mm512_loadu_ps(scores.add(panel * jump + 16 * half)), *max);
                 }
             }
@@ -345,12 +346,13 @@ unsafe fn softmax_of_row(
 /// `2^x` for `x <= 0` to 3e-6 of itself, 0 below -200.
 #[inline(always)]
 fn exp2(_: Avx512Bf16, x: __m512) -> __m512 {
-    // Of least relative error among polynomials of degree 4 on 0..1 (Remez's algorithm).
+    // The polynomial of degree 4 with the least relative error on 0..1, by Remez's algorithm.
     const POLYNOMIAL: [f32; 5] = [0.013_534_168, 0.052_011_46, 0.241_442_75, 0.693_003_83, 1.000_002_6];
     const FLOOR: i32 = 9;
     // SAFETY: the token proves that the CPU has the instructions.
     unsafe {
-        // A NaN stays, being the second operand; minus infinity has no remainder.
+        // A NaN stays one, since the second operand is taken where either is NaN. Minus infinity is raised, since it has no
+        // remainder.
         let x = _mm512_max_ps(_mm512_set1_ps(-200.0), x);
         let r = _mm512_reduce_ps::<FLOOR>(x);
         let [highest, rest @ ..] = POLYNOMIAL;

@@ -39,13 +39,15 @@ mod x86_64;
 
 #[cfg(target_arch = "aarch64")]
 pub(in crate::kernels) use aarch64::{bfdot, sdot};
-#[cfg(any(test, target_arch = "x86_64"))]
+#[cfg(target_arch = "x86_64")]
 pub(in crate::kernels) use amx::AmxMicroKernel;
 pub use format::WeightFormat;
 pub use gate::PackedGate;
 #[cfg(target_arch = "x86_64")]
 pub(in crate::kernels) use micro_kernel::{MicroKernel, Operands, multiply_by_registers};
-pub(in crate::kernels) use panels::{AlignedWords, HALF_PANEL, PANEL_WIDTH, WordPanels};
+#[cfg(target_arch = "x86_64")]
+pub(in crate::kernels) use panels::HALF_PANEL;
+pub(in crate::kernels) use panels::{AlignedWords, PANEL_WIDTH, WordPanels};
 pub(in crate::kernels) use product::Finish;
 pub use row_major::RowMajor;
 pub(in crate::kernels) use select::current as current_kernel;
@@ -53,6 +55,8 @@ pub(in crate::kernels) use select::current as current_kernel;
 pub(in crate::kernels) use tests::packed_as;
 pub use weight::PackedWeight;
 pub(in crate::kernels) use weight::{expect_cpu_f32, read_some};
-pub(in crate::kernels) use words::{from_f32, pair_neighbours, pair_rows};
+#[cfg(target_arch = "x86_64")]
+pub(in crate::kernels) use words::from_f32;
+pub(in crate::kernels) use words::{pair_neighbours, pair_rows};
 #[cfg(target_arch = "x86_64")]
 pub(in crate::kernels) use x86_64::Bf16Dot;

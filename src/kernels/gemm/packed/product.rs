@@ -2,7 +2,7 @@
 
 use super::activations::{Activations, TASK_ROWS};
 use super::micro_kernel::{MAX_ROWS, MicroKernel, Operands, PREFETCH_WORDS};
-use super::panels::{HALF_PANEL, PANEL_WIDTH, STEP_BLOCK, WordPanels};
+use super::panels::{HALF_PANEL, PANEL_WIDTH, WordPanels};
 use crate::kernels::isa::Isa;
 use crate::kernels::simd::{prefetch_l1, prefetch_l2, sigmoid};
 use rayon::prelude::*;
@@ -264,7 +264,7 @@ fn operands<M: MicroKernel>(
     right: &[u32],
     steps: &Range<usize>,
 ) -> Operands {
-    assert!(steps.len() * PANEL_WIDTH <= right.len() && steps.len().is_multiple_of(STEP_BLOCK));
+    assert!(steps.len() * PANEL_WIDTH <= right.len() && steps.len().is_multiple_of(M::STEP_MULTIPLE));
     assert!(rows.end <= left.n && M::SPARE_ROWS <= left.spare_rows && steps.end * M::WORDS <= left.stride);
     let words = &left.words()[rows.start * left.stride + steps.start * M::WORDS..];
     assert!((rows.len() + M::SPARE_ROWS) * left.stride <= words.len() + steps.start * M::WORDS);

@@ -37,7 +37,13 @@ fn in_cpu() -> bool {
     const UNITS: u32 = 1 << 22 | 1 << 24 | 1 << 25;
     const OSXSAVE: u32 = 1 << 27;
     const TILES: u64 = 1 << 17 | 1 << 18;
-    if __cpuid(0).eax < 7 || __cpuid_count(7, 0).edx & UNITS != UNITS || __cpuid(1).ecx & OSXSAVE == 0 {
+    // SAFETY: every CPU of this architecture has the instruction. (Newer compilers know.)
+    #[allow(unused_unsafe)]
+    let (units, features) = unsafe {
+        let units = if __cpuid(0).eax < 7 { 0 } else { __cpuid_count(7, 0).edx };
+        (units, __cpuid(1).ecx)
+    };
+    if units & UNITS != UNITS || features & OSXSAVE == 0 {
         return false;
     }
     // SAFETY: OSXSAVE says that the instruction is there.
