@@ -19,43 +19,42 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 /// Uses that close a circle of files: `(file, used)`.
-const CIRCLES_OF_TODAY: &[(&str, &str)] = &[
-    ("src/benchmarks/mod.rs", "src/benchmarks/ddad.rs"),
-    ("src/benchmarks/mod.rs", "src/benchmarks/folder.rs"),
-    ("src/benchmarks/mod.rs", "src/benchmarks/ibims.rs"),
-    ("src/benchmarks/mod.rs", "src/benchmarks/kitti.rs"),
-    ("src/benchmarks/mod.rs", "src/benchmarks/nyu.rs"),
-    ("src/benchmarks/mod.rs", "src/benchmarks/scannet.rs"),
-    ("src/benchmarks/mod.rs", "src/benchmarks/tum.rs"),
-    ("src/benchmarks/mod.rs", "src/benchmarks/void.rs"),
-    ("src/complete/questions.rs", "src/complete.rs"),
-    ("src/model.rs", "src/adapter.rs"),
-    ("src/model.rs", "src/query/prefix.rs"),
-    ("src/query/answer.rs", "src/query/template.rs"),
-    ("src/query/generate.rs", "src/query/ask.rs"),
-    ("src/query/mode.rs", "src/query/settings.rs"),
-    ("src/refine/surfaces.rs", "src/refine.rs"),
-    ("src/vlm/lora.rs", "src/vlm/weights.rs"),
-];
+const CIRCLES_OF_TODAY: &[(&str, &str)] = &[];
 
 /// Uses against the direction of rooms: `(file, used)`.
-const CROSSINGS_OF_TODAY: &[(&str, &str)] = &[
-    ("src/query/ask.rs", "src/model.rs"),
-    ("src/query/generate.rs", "src/model.rs"),
-    ("src/query/marked.rs", "src/model.rs"),
-    ("src/query/prefix.rs", "src/model.rs"),
-];
+const CROSSINGS_OF_TODAY: &[(&str, &str)] = &[];
 
 /// Files and functions (`file`, `file: function`) that are too long.
 const TOO_LONG_TODAY: &[&str] = &["examples/complete.rs: main", "src/scenes/streets.rs: street"];
 
 /// Rooms, and what they may not use.
 const APART: &[(&str, &[&str])] = &[
-    ("depth", &["vlm", "kernels", "fusion", "query", "model", "adapter", "complete", "refine"]),
-    ("vlm", &["depth", "fusion", "query", "model", "adapter", "complete", "refine"]),
-    ("fusion", &["depth", "query", "model", "adapter", "complete", "refine"]),
-    ("query", &["model", "adapter", "complete", "refine"]),
-    ("model", &["complete", "refine"]),
+    (
+        "depth",
+        &[
+            "vlm",
+            "kernels",
+            "fusion",
+            "query",
+            "model",
+            "complete",
+            "refine",
+            "classical",
+            "metrics",
+            "draw",
+            "scenes",
+            "benchmarks",
+        ],
+    ),
+    ("image", &["vlm", "kernels", "fusion", "query", "model", "complete", "refine"]),
+    ("vlm", &["depth", "fusion", "query", "model", "complete", "refine"]),
+    ("fusion", &["depth", "query", "model", "complete", "refine"]),
+    ("refine", &["vlm", "kernels", "fusion", "query", "model", "complete"]),
+    ("query", &["model", "complete", "refine"]),
+    ("model", &["complete", "refine", "supervise", "hub"]),
+    ("complete", &["supervise", "hub", "benchmarks", "scenes"]),
+    ("scenes", &["vlm", "kernels", "fusion", "query", "model", "complete", "refine", "benchmarks"]),
+    ("benchmarks", &["vlm", "kernels", "fusion", "query", "model", "complete", "refine"]),
 ];
 /// All that `kernels` may use.
 const BELOW_KERNELS: &[&str] = &["kernels", "error"];
