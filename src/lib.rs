@@ -22,7 +22,7 @@ pub mod kernels;
 pub mod model;
 pub mod query;
 pub mod refine;
-#[cfg(any(feature = "train", feature = "benchmarks"))]
+#[cfg(any(feature = "train", feature = "benchmarks", feature = "meshes"))]
 pub mod scenes;
 #[cfg(feature = "train")]
 pub mod supervise;
