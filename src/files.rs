@@ -15,7 +15,8 @@ pub(crate) fn read_text(path: &Path) -> Result<Vec<u8>> {
     read_within(path, TEXT_LIMIT)
 }
 
-fn read_within(path: &Path, limit: u64) -> Result<Vec<u8>> {
+/// Reads a whole file of at most `limit` bytes.
+pub(crate) fn read_within(path: &Path, limit: u64) -> Result<Vec<u8>> {
     let file = fs::File::open(path).map_err(Error::io(path))?;
     let mut bytes = Vec::new();
     file.take(limit + 1).read_to_end(&mut bytes).map_err(Error::io(path))?;

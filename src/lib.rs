@@ -71,6 +71,7 @@
 //! |---|---|---|
 //! | `tiny` | yes | the embedded checkpoint: [`DepthCompleter`]`::tiny` |
 //! | `train` | no | `scenes` and `supervise` |
+//! | `meshes` | no | `scenes` with rooms furnished by OBJ models |
 //! | `benchmarks` | no | `benchmarks`: NYUv2, VOID, iBims-1, KITTI, DDAD, TUM, ScanNet, folders |
 //! | `hub` | no | `hub`: checkpoints by name; the one feature that builds C |
 //! | `cuda`, `cudnn`, `metal`, `accelerate`, `mkl` | no | candle's back ends |
@@ -105,7 +106,7 @@ pub mod metrics;
 mod model;
 mod query;
 pub mod refine;
-#[cfg(any(feature = "train", feature = "benchmarks"))]
+#[cfg(any(feature = "train", feature = "benchmarks", feature = "meshes"))]
 pub mod scenes;
 #[cfg(feature = "train")]
 pub mod supervise;

@@ -2,8 +2,7 @@
 
 mod common;
 
-use common::program::program;
-use common::program::{FEATURES, Place};
+use common::program::{FEATURES, Place, program};
 use serde_json::Value;
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
@@ -191,5 +190,28 @@ fn a_test_knows_where_cargo_has_put_it() {
         ("x86_64-pc-windows-msvc/thin/deps/t.exe", place(Some("x86_64-pc-windows-msvc"), "thin")),
     ] {
         assert_eq!(Place::of(&dir.path().join(path)), expected, "{path}");
+    }
+}
+
+#[test]
+fn render_makes_sheets_and_measures_streets_in_rings() {
+    let dir = tempfile::tempdir().unwrap();
+    let (sheet, out) = (dir.path().join("sheet.png"), dir.path().join("out"));
+    let size = ["--width", "64", "--height", "32", "--count", "5"];
+    let street = ["--recipe", "street-lidar", "--rings", "16", "--sheet", text(&sheet), "--out", text(&out)];
+    let done = run("render", &[&size[..], &street].concat());
+    assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+    // Four pairs of a frame and its depth in a row, two rows.
+    assert_eq!(image::image_dimensions(&sheet).unwrap(), (512, 64));
+    let sparse = out.join("sparse/scene_2000000.png");
+    let sparse = sdim::SparseDepth::read(sparse, Some(sdim::DepthScale::millimetres())).unwrap();
+    assert!((20..64 * 16).contains(&sparse.measured()), "{}", sparse.measured());
+    for bad in [
+        &["--recipe", "furnished"][..],
+        &["--recipe", "attic"],
+        &["--recipe", "street-lidar", "--rings", "17"],
+    ] {
+        let failed = run("render", &[bad, &["--sheet", text(&sheet)]].concat());
+        assert!(!failed.status.success(), "{bad:?}");
     }
 }

@@ -1,23 +1,31 @@
 //! Where frames come from.
 
 use crate::Args;
+use crate::settings::Fnv;
+use anyhow::Context;
 use sdim::benchmarks::{Dataset, LayoutOptions, Sample};
-use sdim::scenes::procedural;
+use sdim::scenes::furnished::{Library, Split, furnished};
+use sdim::scenes::{RgbdFrame, procedural};
+use std::path::Path;
 
 /// Seeds from here on are never drawn in training with the default configuration.
 const HELD_OUT: u64 = 2_000_000;
 
 /// Opens the data set that the arguments name.
 pub fn open(args: &Args) -> anyhow::Result<Box<dyn Dataset>> {
-    match (&args.data, args.procedural) {
-        (Some(dir), _) => {
+    match (&args.data, args.procedural, args.furnished) {
+        (Some(dir), ..) => {
             let mut options = LayoutOptions::default().with_seed(args.seed);
             (options.scale, options.range) = (args.depth_scale, args.range);
             options.frames = args.frame_list.clone();
             Ok(args.layout.open(dir, &options)?)
         }
-        (None, Some(0) | None) => anyhow::bail!("--procedural 0: expected at least 1 scene"),
-        (None, Some(count)) => Ok(Box::new(Procedural(count))),
+        (None, Some(count), _) if count > 0 => Ok(Box::new(Procedural(count))),
+        (None, None, Some(count)) if count > 0 => {
+            let dir = args.library.as_deref().context("--furnished: expected --library DIR")?;
+            Ok(Box::new(Furnished::open(dir, count)?))
+        }
+        _ => anyhow::bail!("--procedural 0 or --furnished 0: expected at least 1 scene"),
     }
 }
 
@@ -50,13 +58,45 @@ impl Dataset for Procedural {
     }
 
     fn load(&self, index: usize) -> sdim::Result<Sample> {
-        let frame = procedural(HELD_OUT + index as u64, 320, 240)?;
-        Ok(Sample {
-            name: self.name(index),
-            rgb: frame.rgb,
-            gt: frame.depth,
-            sparse: None,
-            masks: Vec::new(),
-        })
+        Ok(sample(self.name(index), procedural(HELD_OUT + index as u64, 320, 240)?))
     }
+}
+
+/// Rooms and models that training never saw.
+struct Furnished {
+    library: Library,
+    count: usize,
+    /// A number made from the models' ids: another library gives other rooms.
+    print: String,
+}
+
+impl Furnished {
+    fn open(dir: &Path, count: usize) -> anyhow::Result<Self> {
+        let library = Library::open(dir)?.part(Split::HeldOut)?;
+        let mut print = Fnv::default();
+        library.models().iter().for_each(|m| print.add(format!("{} {}", m.id, m.triangles).as_bytes()));
+        Ok(Self { library, count, print: print.text() })
+    }
+}
+
+impl Dataset for Furnished {
+    fn len(&self) -> usize {
+        self.count
+    }
+
+    fn name(&self, index: usize) -> String {
+        format!("room-{}-{index}", self.print)
+    }
+
+    fn has_measurements(&self, _: usize) -> bool {
+        false
+    }
+
+    fn load(&self, index: usize) -> sdim::Result<Sample> {
+        Ok(sample(self.name(index), furnished(&self.library, HELD_OUT + index as u64, 320, 240)?))
+    }
+}
+
+fn sample(name: String, frame: RgbdFrame) -> Sample {
+    Sample { name, rgb: frame.rgb, gt: frame.depth, sparse: None, masks: Vec::new() }
 }

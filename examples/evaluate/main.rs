@@ -63,11 +63,18 @@ pub struct Args {
     #[arg(long, default_value = "folder")]
     layout: Layout,
     /// The data set.
-    #[arg(long, required_unless_present_any = ["procedural", "merge"])]
+    #[arg(long, required_unless_present_any = ["procedural", "furnished", "merge"])]
     data: Option<PathBuf>,
     /// Score on this many held-out procedural scenes of 320x240 instead.
     #[arg(long, conflicts_with_all = ["data", "layout", "depth_scale", "range", "frame_list", "resample"])]
     procedural: Option<usize>,
+    /// Score on this many rooms of 320x240 furnished with models of --library, rooms and models held out from training.
+    #[arg(long, requires = "library",
+        conflicts_with_all = ["data", "layout", "depth_scale", "range", "resample", "procedural"])]
+    furnished: Option<usize>,
+    /// Folder of furniture, as scripts/furniture.sh made it or packed by the example `furniture`.
+    #[arg(long, requires = "furnished")]
+    library: Option<PathBuf>,
     /// Unit of integer depth files of layout folder: mm, kitti, tum or units per metre.
     #[arg(long)]
     depth_scale: Option<DepthScale>,
@@ -125,7 +132,7 @@ pub struct Args {
     shard: Option<Shard>,
     /// Make the report of finished runs or shards instead of running; into --out if given.
     #[arg(long, num_args = 1.., value_name = "DIR", conflicts_with_all = [
-        "data", "procedural", "layout", "depth_scale", "range", "frame_list", "points", "pattern", "resample", "score", "seed", "limit",
+        "data", "procedural", "furnished", "library", "layout", "depth_scale", "range", "frame_list", "points", "pattern", "resample", "score", "seed", "limit",
         "checkpoint", "adapter", "methods", "plan", "weights", "device", "shard", "figures", "verbose"])]
     merge: Vec<PathBuf>,
     /// Draw the first frames into this folder, all methods and their errors beside each other.

@@ -43,7 +43,12 @@ impl Settings {
         (0..count).for_each(|i| names.add(frames.name(i).as_bytes()));
         Ok(Self {
             version: env!("CARGO_PKG_VERSION").to_string(),
-            layout: if args.data.is_some() { args.layout.name() } else { "procedural" }.to_string(),
+            layout: match (&args.data, args.furnished) {
+                (Some(_), _) => args.layout.name(),
+                (None, Some(_)) => "furnished",
+                (None, None) => "procedural",
+            }
+            .to_string(),
             frames: count,
             names: names.text(),
             points: args.points(source::all_own(args, frames)?)?,
@@ -95,7 +100,7 @@ fn path(dir: &Path) -> PathBuf {
 }
 
 /// The hash of Fowler, Noll and Vo, 64 bits (FNV-1a), over pieces.
-struct Fnv(u64);
+pub struct Fnv(u64);
 
 impl Default for Fnv {
     fn default() -> Self {
@@ -104,11 +109,11 @@ impl Default for Fnv {
 }
 
 impl Fnv {
-    fn text(&self) -> String {
+    pub fn text(&self) -> String {
         format!("{:016x}", self.0)
     }
 
-    fn add(&mut self, piece: &[u8]) {
+    pub fn add(&mut self, piece: &[u8]) {
         // The end of a piece counts, so that "ab", "c" is not "a", "bc".
         for byte in piece.iter().chain(&[0xff]) {
             self.0 = (self.0 ^ u64::from(*byte)).wrapping_mul(0x0100_0000_01b3);

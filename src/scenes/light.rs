@@ -177,9 +177,12 @@ fn smooth_edges(colour: &mut [V3], solid: &[u32], width: usize) {
     }
 }
 
-/// Exposure, colour cast, vignette, blur, noise, tone curve and 8 bits.
-pub(super) fn develop(stage: &mut Stage, mut colour: Vec<V3>, width: usize, height: usize) -> RgbImage {
-    let luma = |c: &V3| 0.3 * c[0] + 0.6 * c[1] + 0.1 * c[2];
+fn luma(c: &V3) -> f32 {
+    0.3 * c[0] + 0.6 * c[1] + 0.1 * c[2]
+}
+
+/// Exposure and the camera's own faults, at random.
+pub(super) fn develop(stage: &mut Stage, colour: Vec<V3>, width: usize, height: usize) -> RgbImage {
     let step = (colour.len() / 2048).max(1);
     let mut sample: Vec<f32> = colour.iter().step_by(step).map(luma).collect();
     sample.sort_by(f32::total_cmp);
@@ -192,40 +195,66 @@ pub(super) fn develop(stage: &mut Stage, mut colour: Vec<V3>, width: usize, heig
     } else {
         [1.0; 3]
     };
-    let cast = mul(cast, gain);
-    let vignette = if stage.chance(0.5) { stage.real(0.0, 0.5) } else { 0.0 };
-    let blur = if stage.chance(0.6) { stage.real(0.0, 0.22) } else { 0.0 };
-    let noise = if stage.chance(0.7) { stage.log(0.002, 0.035) } else { 0.0 };
-    let saturation = stage.real(0.6, 1.25);
-    let gamma = 1.0 / stage.real(1.8, 2.5);
-    let contrast = stage.real(0.0, 0.8);
-    let lift = if stage.chance(0.3) { stage.real(0.0, 0.06) } else { 0.0 };
+    let faults = Finish {
+        cast: mul(cast, gain),
+        vignette: if stage.chance(0.5) { stage.real(0.0, 0.5) } else { 0.0 },
+        blur: if stage.chance(0.6) { stage.real(0.0, 0.22) } else { 0.0 },
+        noise: if stage.chance(0.7) { stage.log(0.002, 0.035) } else { 0.0 },
+        saturation: stage.real(0.6, 1.25),
+        gamma: 1.0 / stage.real(1.8, 2.5),
+        contrast: stage.real(0.0, 0.8),
+        lift: if stage.chance(0.3) { stage.real(0.0, 0.06) } else { 0.0 },
+        seed: stage.rng.random(),
+    };
+    finish(colour, width, height, &faults)
+}
+
+/// What a camera does to exposed light.
+pub(super) struct Finish {
+    /// Factors of the channels.
+    pub cast: V3,
+    /// Share of the light that is lost in the corners.
+    pub vignette: f32,
+    /// Weight of each neighbour in a blur.
+    pub blur: f32,
+    /// Deviation of the noise, as a part of white.
+    pub noise: f32,
+    pub saturation: f32,
+    pub gamma: f32,
+    /// Share of an S-shaped curve.
+    pub contrast: f32,
+    /// Brightness of black.
+    pub lift: f32,
+    pub seed: u32,
+}
+
+/// Colour cast, vignette, blur, noise, tone curve and 8 bits. `colour` is linear, white is 1.
+pub(super) fn finish(mut colour: Vec<V3>, width: usize, height: usize, f: &Finish) -> RgbImage {
     let curve: Vec<f32> = (0..1025)
         .map(|i| {
-            let v = (i as f32 / 1024.0).powf(gamma);
+            let v = (i as f32 / 1024.0).powf(f.gamma);
             let s = v * v * (3.0 - 2.0 * v);
-            255.0 * (lift + (1.0 - lift) * (v + contrast * (s - v)))
+            255.0 * (f.lift + (1.0 - f.lift) * (v + f.contrast * (s - v)))
         })
         .collect();
-    if blur > 0.0 {
-        soften(&mut colour, width, height, blur);
+    if f.blur > 0.0 {
+        soften(&mut colour, width, height, f.blur);
     }
-    let seed: u32 = stage.rng.random();
     let (cx, cy) = (0.5 * width as f32, 0.5 * height as f32);
     let scale = 1.0 / (cx * cx + cy * cy);
     let mut bytes = Vec::with_capacity(width * height * 3);
     for (i, c) in colour.iter().enumerate() {
         let (x, y) = ((i % width) as f32 - cx, (i / width) as f32 - cy);
-        let c = times(*c, mul(cast, 1.0 - vignette * (x * x + y * y) * scale));
+        let c = times(*c, mul(f.cast, 1.0 - f.vignette * (x * x + y * y) * scale));
         let grey = luma(&c);
         for (k, &v) in c.iter().enumerate() {
-            let v = grey + (v - grey) * saturation;
+            let v = grey + (v - grey) * f.saturation;
             let mut out = curve[(v * 1024.0).clamp(0.0, 1024.0) as usize];
-            if noise > 0.0 {
-                let h = hash(i as i32, k as i32, seed);
+            if f.noise > 0.0 {
+                let h = hash(i as i32, k as i32, f.seed);
                 let sum = (h & 255) + (h >> 8 & 255) + (h >> 16 & 255) + (h >> 24);
                 // Four bytes add up to nearly a Gaussian of deviation 148.
-                out += (sum as f32 - 510.0) * (noise * 255.0 / 148.0);
+                out += (sum as f32 - 510.0) * (f.noise * 255.0 / 148.0);
             }
             bytes.push((out + 0.5) as u8);
         }

@@ -5,7 +5,11 @@
 
 mod camera;
 mod cast;
+mod drive;
+#[cfg(feature = "meshes")]
+pub mod furnished;
 mod furniture;
+mod lidar;
 mod light;
 mod objects;
 mod rooms;
@@ -16,6 +20,7 @@ mod stage;
 mod streets;
 mod tables;
 mod texture;
+mod traffic;
 
 use image::RgbImage;
 use rand::{RngCore, SeedableRng};
@@ -23,6 +28,7 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::depth::Intrinsics;
 use crate::error::{Error, Result};
+pub use lidar::SpinningLidar;
 use stage::Stage;
 
 /// An RGB image with the depth of every pixel.
@@ -56,11 +62,7 @@ const LARGEST_SIDE: usize = 8192;
 /// The same seed and size always give the same frame. It runs on the calling thread only; make many frames in parallel.
 /// Fails with [`Error::Argument`] when a side is 0 or above 8192 pixels.
 pub fn procedural(seed: u64, width: usize, height: usize) -> Result<RgbdFrame> {
-    for (name, side) in [("width", width), ("height", height)] {
-        if !(1..=LARGEST_SIDE).contains(&side) {
-            return Err(Error::argument(name, side, format!("1 to {LARGEST_SIDE} pixels")));
-        }
-    }
+    check_size(width, height)?;
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     // A camera may end up before a blank wall or under the floor; a few scenes are thrown away for that.
     let (mut stage, mut hits) = attempt(&mut rng, width, height);
@@ -70,18 +72,68 @@ pub fn procedural(seed: u64, width: usize, height: usize) -> Result<RgbdFrame> {
         }
         (stage, hits) = attempt(&mut rng, width, height);
     }
-    let colour = light::shade(&mut stage, &hits, width);
-    let rgb = light::develop(&mut stage, colour, width, height);
+    let rgb = picture(&mut stage, &hits, width, height);
     // The whole scene in another size looks the same: sizes must be learnt from the measurements.
     let scale = if stage.chance(0.5) { stage.log(0.5, 2.0) } else { 1.0 };
     let depth = hits.depth.iter().map(|&t| if t.is_finite() { t * scale } else { f32::NAN }).collect();
     Ok(RgbdFrame { rgb, depth, intrinsics: stage.camera.k })
 }
 
-fn attempt(rng: &mut ChaCha8Rng, width: usize, height: usize) -> (Stage, cast::Hits) {
+/// A street as a camera on a car sees it, 1.6 to 2 m above the road, with houses, trees, poles, vehicles, people: 2 to 120 m and
+/// farther, true to scale. [`SpinningLidar`] measures in it.
+///
+/// The same seed and size always give the same frame. Fails as [`procedural`] does.
+pub fn street(seed: u64, width: usize, height: usize) -> Result<RgbdFrame> {
+    check_size(width, height)?;
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    // Other streets than those of `procedural`.
+    rng.set_stream(1);
+    let (mut stage, mut hits) = ride(&mut rng, width, height);
+    for _ in 0..6 {
+        if interesting(&hits) {
+            break;
+        }
+        (stage, hits) = ride(&mut rng, width, height);
+    }
+    let rgb = picture(&mut stage, &hits, width, height);
+    let depth = hits.depth.iter().map(|&t| if t.is_finite() { t } else { f32::NAN }).collect();
+    Ok(RgbdFrame { rgb, depth, intrinsics: stage.camera.k })
+}
+
+fn picture(stage: &mut Stage, hits: &cast::Hits, width: usize, height: usize) -> RgbImage {
+    let colour = light::shade(stage, hits, width);
+    light::develop(stage, colour, width, height)
+}
+
+fn ride(rng: &mut ChaCha8Rng, width: usize, height: usize) -> (Stage, cast::Hits) {
+    let mut stage = empty(rng, width, height);
+    // Cameras of cars: from wide ones to those that look far ahead.
+    let mut k = Intrinsics::from_fov(width, height, stage.real(1.0, 1.65));
+    k.cx += stage.real(-0.03, 0.03) * width as f32;
+    k.cy += stage.real(-0.05, 0.05) * height as f32;
+    stage.drive(k);
+    let hits = cast::cast(&stage.solids, &stage.camera, width, height);
+    (stage, hits)
+}
+
+/// A stage without anything, with random numbers of its own.
+fn empty(rng: &mut ChaCha8Rng, width: usize, height: usize) -> Stage {
     let own = ChaCha8Rng::seed_from_u64(rng.next_u64());
     let start = camera::Camera::new(Intrinsics::from_fov(width, height, 1.0), [0.0; 3], 0.0, 0.0, 0.0);
-    let mut stage = Stage::new(own, start);
+    Stage::new(own, start)
+}
+
+fn check_size(width: usize, height: usize) -> Result<()> {
+    for (name, side) in [("width", width), ("height", height)] {
+        if !(1..=LARGEST_SIDE).contains(&side) {
+            return Err(Error::argument(name, side, format!("1 to {LARGEST_SIDE} pixels")));
+        }
+    }
+    Ok(())
+}
+
+fn attempt(rng: &mut ChaCha8Rng, width: usize, height: usize) -> (Stage, cast::Hits) {
+    let mut stage = empty(rng, width, height);
     let mut k = Intrinsics::from_fov(width, height, stage.real(0.7, std::f32::consts::FRAC_PI_2));
     k.cx += stage.real(-0.04, 0.04) * width as f32;
     k.cy += stage.real(-0.04, 0.04) * height as f32;

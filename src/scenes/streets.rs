@@ -8,7 +8,7 @@ use super::texture::Pattern;
 use crate::depth::Intrinsics;
 
 impl Stage {
-    fn daylight(&mut self) {
+    pub(super) fn daylight(&mut self) {
         let (a, e) = (self.real(0.0, TAU), self.real(0.25, 1.3));
         let to: V3 = [e.cos() * a.sin(), e.sin(), e.cos() * a.cos()];
         let overcast = self.chance(0.35);
@@ -27,7 +27,7 @@ impl Stage {
         }
     }
 
-    fn building(&mut self, place: &Place, half: V3) {
+    pub(super) fn building(&mut self, place: &Place, half: V3) {
         let (a, b) = (self.calm(), [self.real(0.03, 0.3); 3]);
         let pattern =
             self.pick(&[Pattern::Window, Pattern::Window, Pattern::Brick, Pattern::Plain, Pattern::Stripe]);
@@ -108,7 +108,7 @@ impl Stage {
         }
     }
 
-    fn tree(&mut self, place: &Place, height: f32) {
+    pub(super) fn tree(&mut self, place: &Place, height: f32) {
         let bark = mul([0.5, 0.38, 0.28], self.real(0.2, 0.8));
         let trunk = self.paint(Pattern::Cloud, bark, mul(bark, 0.5), 0.3);
         let season = self.real(0.0, 1.0);
@@ -142,7 +142,7 @@ impl Stage {
         }
     }
 
-    fn pole(&mut self, place: &Place) {
+    pub(super) fn pole(&mut self, place: &Place) {
         let grey = [self.real(0.05, 0.6); 3];
         let m = self.plain(grey);
         let h = self.real(2.2, 9.0);
@@ -261,7 +261,7 @@ impl Stage {
         self.focus = ([at[0], 0.0, 18.0], 22.0);
     }
 
-    fn hills(&mut self) {
+    pub(super) fn hills(&mut self) {
         let world = self.world();
         for _ in 0..self.int(1, 5) {
             let g = [self.real(0.1, 0.4), self.real(0.2, 0.4), self.real(0.05, 0.25)];

@@ -164,3 +164,28 @@ fn scenes_differ_in_scale_and_content() {
     assert!(medians[4] < 1.5 && medians[43] > 6.0, "{medians:?}");
     assert!(sky >= 3 && edges >= 30, "{sky} with sky, {edges} with depth edges");
 }
+
+#[test]
+fn streets_are_seen_from_a_car_and_reach_far() {
+    let (mut near, mut far) = (0, 0);
+    for seed in 0..12 {
+        let frame = street(seed, 96, 48).unwrap();
+        let again = street(seed, 96, 48).unwrap();
+        assert!(
+            frame.rgb == again.rgb
+                && frame.depth.iter().zip(&again.depth).all(|(a, b)| a.to_bits() == b.to_bits())
+        );
+        let mut d: Vec<f32> = frame.depth.iter().copied().filter(|d| d.is_finite()).collect();
+        d.sort_by(f32::total_cmp);
+        assert!(d[0] > 1.0, "seed {seed}: {} m before the car", d[0]);
+        near += usize::from(d[d.len() / 20] < 12.0);
+        far += usize::from(d[d.len() * 19 / 20] > 25.0);
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        for rings in [16, 32, 64] {
+            let lidar = SpinningLidar::rings(rings).unwrap().mounted(&mut rng);
+            let sparse = lidar.scan(&frame.depth, 96, 48, &frame.intrinsics, &mut rng).unwrap();
+            assert!(sparse.measured() > 4 * rings, "seed {seed}: {} of {rings} rings", sparse.measured());
+        }
+    }
+    assert!(near >= 9 && far >= 6, "{near} {far}");
+}

@@ -85,7 +85,12 @@ impl Material {
             return self.base;
         }
         let (uv, st) = surface(solid, p);
-        let c = self.colour(uv, st, footprint, solid);
+        self.albedo_at(uv, st, solid.half[0] / solid.half[1].max(1e-6), footprint)
+    }
+
+    /// The same at surface coordinates `uv` in metres, and `st` in [-1, 1] over a face of which `ratio` is width by height.
+    pub fn albedo_at(&self, uv: [f32; 2], st: [f32; 2], ratio: f32, footprint: f32) -> V3 {
+        let c = self.colour(uv, st, footprint, ratio);
         if self.grain <= 0.0 {
             return c;
         }
@@ -93,7 +98,7 @@ impl Material {
         mul(c, (1.0 + 2.0 * self.grain * g).max(0.05))
     }
 
-    fn colour(&self, uv: [f32; 2], st: [f32; 2], footprint: f32, solid: &Solid) -> V3 {
+    fn colour(&self, uv: [f32; 2], st: [f32; 2], footprint: f32, ratio: f32) -> V3 {
         let q = [uv[0] / self.period, uv[1] / self.period];
         let (i, j) = (floor(q[0]), floor(q[1]));
         let (a, b) = (q[0] - i as f32, q[1] - j as f32);
@@ -136,7 +141,7 @@ impl Material {
                 let tone = 0.25 * (hash01(board, 1, self.seed) - 0.5);
                 mul(mix(self.base, self.second, 0.35 + (ring - 0.35) * keep), 1.0 + tone)
             }
-            Pattern::Print => self.print(st, solid),
+            Pattern::Print => self.print(st, ratio),
             Pattern::Text => {
                 let line = b > 0.25 && b < 0.75 && hash01(floor(q[0] * 2.2), j, self.seed) > 0.3;
                 two(line && st[0].abs() < 0.85 && st[1].abs() < 0.9, 0.3)
@@ -161,10 +166,10 @@ impl Material {
     }
 
     /// Nested random rectangles with discs and lines of "text" in some: packaging, posters, screens, book covers.
-    fn print(&self, st: [f32; 2], solid: &Solid) -> V3 {
+    fn print(&self, st: [f32; 2], ratio: f32) -> V3 {
         let (mut s, mut t) = (0.5 * st[0] + 0.5, 0.5 * st[1] + 0.5);
         let (mut key, mut c) = (self.seed, self.base);
-        let ratio = (solid.half[0] / solid.half[1].max(1e-6)).clamp(0.3, 3.0);
+        let ratio = ratio.clamp(0.3, 3.0);
         for level in 0..4u32 {
             let pick = |n: u32| hash01(n as i32, level as i32, key);
             let cut = 0.2 + 0.6 * pick(0);

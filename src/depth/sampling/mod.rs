@@ -20,7 +20,8 @@ use scan::{Scan, feature_weights};
 pub enum SparsePattern {
     /// Every valid pixel is as likely as every other.
     Uniform,
-    /// Slightly tilted rows of a scanner, with gaps.
+    /// Slightly tilted rows of a scanner, with gaps. `scenes::SpinningLidar` has the geometry of a real one, for
+    /// frames whose intrinsics are known.
     Lidar {
         /// Number of rows, at least 1.
         lines: usize,
@@ -110,7 +111,8 @@ fn valid_pixels(depth: &[f32], width: usize, height: usize, points: usize) -> Re
     if valid.is_empty() { Err(Error::NoMeasurement { width, height }) } else { Ok(valid) }
 }
 
-fn keep(depth: &[f32], width: usize, height: usize, chosen: &[usize]) -> Result<SparseDepth> {
+/// A map of the chosen pixels alone.
+pub(crate) fn keep(depth: &[f32], width: usize, height: usize, chosen: &[usize]) -> Result<SparseDepth> {
     let mut sparse = vec![f32::NAN; depth.len()];
     for &i in chosen {
         sparse[i] = depth[i];
