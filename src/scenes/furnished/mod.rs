@@ -19,6 +19,7 @@ mod model;
 mod obj;
 mod openings;
 mod pack;
+mod packed;
 mod plan;
 mod profile;
 mod render;

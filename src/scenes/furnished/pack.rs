@@ -12,20 +12,16 @@ use std::sync::Arc;
 
 use safetensors::Dtype;
 use safetensors::tensor::TensorView;
-use serde::{Deserialize, Serialize};
 
 use super::geometry::Geometry;
 use super::library::Library;
 use super::model::Model;
+use super::packed::{CATALOGUE, Catalogue, FORMAT, Packed, PackedCover, TENSORS};
 use super::texture::Texture;
 use crate::error::{Error, Result};
 use crate::files::write_whole;
-use crate::scenes::space::V3;
 
-pub(super) const TENSORS: &str = "furniture.safetensors";
-pub(super) const CATALOGUE: &str = "furniture.json";
 const ATTRIBUTION: &str = "ATTRIBUTION.md";
-pub(super) const FORMAT: &str = "sdim furniture 1";
 
 /// What [`Library::pack`] keeps.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -55,40 +51,6 @@ impl PackOptions {
         self.seed = seed;
         self
     }
-}
-
-#[derive(Serialize, Deserialize)]
-pub(super) struct Catalogue {
-    pub format: String,
-    pub models: Vec<Packed>,
-}
-
-#[derive(Serialize, Deserialize)]
-pub(super) struct Packed {
-    pub id: String,
-    pub name: String,
-    pub tags: String,
-    pub category: String,
-    pub author: String,
-    pub licence: String,
-    pub size: V3,
-    pub elevation: f32,
-    pub opening: bool,
-    pub behind: f32,
-    pub bounds: [V3; 2],
-    pub uv: Option<[[f32; 2]; 2]>,
-    pub covers: Vec<PackedCover>,
-}
-
-#[derive(Serialize, Deserialize)]
-pub(super) struct PackedCover {
-    pub colour: V3,
-    pub texture: Option<usize>,
-    pub mask: Option<usize>,
-    pub opacity: f32,
-    pub gloss: f32,
-    pub exponent: f32,
-    pub glow: f32,
 }
 
 impl Library {

@@ -9,7 +9,7 @@ use safetensors::{Dtype, SafeTensors};
 use super::catalogue::Entry;
 use super::geometry::{Face, Geometry};
 use super::model::{Cover, Model};
-use super::pack::{CATALOGUE, Catalogue, FORMAT, Packed, TENSORS};
+use super::packed::{CATALOGUE, Catalogue, FORMAT, Packed, TENSORS};
 use super::role::role;
 use super::texture::Texture;
 use crate::error::{Error, Result};
