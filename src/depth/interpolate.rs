@@ -2,9 +2,8 @@
 
 use rayon::prelude::*;
 
-use super::linear::Linear;
 use super::mesh::{Mesh, Owner, cross};
-use super::{SparseDepth, check_length, pixel_count};
+use super::{SparseDepth, check_length, faces_a_hole, pixel_count};
 use crate::error::Result;
 
 /// Gives every pixel the depth of the nearest measured pixel (Euclidean, exact). `width * height` metres.
@@ -49,7 +48,32 @@ fn from_nearest(
 /// # Errors
 /// [`Error::NoMeasurement`](crate::error::Error::NoMeasurement) for a map without measurements.
 pub fn linear(sparse: &SparseDepth) -> Result<Vec<f32>> {
-    Ok(Linear::new(sparse)?.raster())
+    sparse.require_points()?;
+    let edge = rim(sparse);
+    if edge.is_empty() {
+        return Ok(sparse.as_slice().to_vec());
+    }
+    let positions: Vec<_> = edge.iter().map(|&(x, y, _)| (x as f32, y as f32)).collect();
+    let values: Vec<_> = edge.iter().map(|&(_, _, depth)| depth).collect();
+    let mut out = Interpolator::new(&positions, sparse.width(), sparse.height())?.raster(&values);
+    for (pixel, &depth) in out.iter_mut().zip(sparse.as_slice()) {
+        if !depth.is_nan() {
+            *pixel = depth;
+        }
+    }
+    Ok(out)
+}
+
+/// Measurements with a missing pixel among the eight around them, row by row: none if nothing is missing.
+///
+/// The triangles at any other are the small ones towards its eight neighbours and hold no missing pixel, so it can be left out of
+/// a mesh without changing what that says about missing pixels. In dense maps this saves nearly all of the work.
+pub(crate) fn rim(sparse: &SparseDepth) -> Vec<(usize, usize, f32)> {
+    let (width, height) = (sparse.width(), sparse.height());
+    if sparse.measured() == width * height {
+        return Vec::new();
+    }
+    sparse.points().filter(|&(x, y, _)| faces_a_hole(sparse.as_slice(), width, height, x, y)).collect()
 }
 
 /// No measurement in this column.
@@ -134,10 +158,6 @@ impl Interpolator {
     /// [`Error::ImageSize`](crate::error::Error::ImageSize) for an empty or absurdly large frame.
     pub fn new(points: &[(f32, f32)], width: usize, height: usize) -> Result<Self> {
         Ok(Self { mesh: Mesh::new(points, width, height)?, points: points.len() })
-    }
-
-    pub(crate) fn mesh(&self) -> &Mesh {
-        &self.mesh
     }
 
     /// Number of points given to [`Interpolator::new`]: the number of values to pass.

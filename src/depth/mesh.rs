@@ -1,13 +1,10 @@
 //! A Delaunay mesh over scattered points, with the mesh element that owns each pixel.
 
-mod holder;
-
 use delaunator::{EMPTY, Point, triangulate};
 use rayon::prelude::*;
 
 use super::pixel_count;
 use crate::error::{Error, Result};
-pub(crate) use holder::holder;
 
 /// Where a pixel lies: inside a triangle, or outside the hull and nearest to a site.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

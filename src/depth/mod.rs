@@ -8,7 +8,6 @@ pub mod colour;
 pub mod figure;
 pub mod interpolate;
 mod label;
-pub(crate) mod linear;
 mod map;
 pub(crate) mod mesh;
 pub mod metrics;

@@ -9,7 +9,7 @@
 //! Thresholds were chosen on 60 procedural scenes (uniform, SfM and LiDAR-ring measurements, 100 to 1500, 2 and 5 % of them times or
 //! divided by 1.5 to 3) for less than one clean measurement in a hundred.
 
-use super::linear::rim;
+use super::interpolate::rim;
 use super::mesh::Mesh;
 use super::{SparseDepth, is_valid};
 use crate::error::{Error, Result};
