@@ -105,10 +105,9 @@ fn the_bundled_frame_bears_wrong_measurements() {
 fn without_a_flag_the_map_is_the_same_to_the_bit() {
     let scene = procedural(3_000_001, 160, 120).unwrap();
     let mut untouched = 0;
-    for points in [8, 60, 300] {
-        let mut rng = ChaCha8Rng::seed_from_u64(points as u64);
-        let sparse =
-            SparsePattern::Uniform.sample(&scene.rgb, &scene.depth, 160, 120, points, &mut rng).unwrap();
+    for seed in 0..8 {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let sparse = SparsePattern::Uniform.sample(&scene.rgb, &scene.depth, 160, 120, 50, &mut rng).unwrap();
         let (checked, trusted) =
             (run(&scene.rgb, &sparse, Outliers::Ignore), run(&scene.rgb, &sparse, Outliers::Trust));
         assert!(trusted.flagged.is_empty());

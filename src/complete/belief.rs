@@ -1,6 +1,6 @@
 //! Which measurements a frame is completed from.
 
-use super::{CancelToken, CompleteOptions, DepthCompleter, Outliers, StageSeconds};
+use super::{CompleteOptions, DepthCompleter, Outliers, StageSeconds};
 use crate::depth::outliers::{Contradiction, contradictions, without};
 use crate::depth::{SparseDepth, interpolate};
 use crate::error::Result;
@@ -98,9 +98,8 @@ impl DepthCompleter {
         };
         let queries: Vec<Query> = doubtful.iter().map(query).collect();
         let mode = options.answer.as_ref().unwrap_or(&settings.answer_mode);
-        ask_within(&self.model, prefix, &queries, mode, options.max_memory, &mut |_| {
-            !options.cancel.as_ref().is_some_and(CancelToken::is_cancelled)
-        })
+        // They are few: a cancellation is seen after the first batch of the plan.
+        ask_within(&self.model, prefix, &queries, mode, options.max_memory, &mut |_| true)
     }
 
     /// Encodes a frame and reads what its queries share.
