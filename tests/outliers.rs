@@ -17,7 +17,7 @@ use std::sync::LazyLock;
 static TINY: LazyLock<DepthCompleter> = LazyLock::new(|| DepthCompleter::tiny().unwrap());
 
 fn options() -> CompleteOptions {
-    CompleteOptions::default().with_plan(QueryPlan::Stride(8))
+    CompleteOptions::default().with_plan(QueryPlan::Stride(8)).with_outliers(Outliers::Ignore)
 }
 
 /// A part of the measurements times or divided by 1.5 to 3, with the pixels of these.
@@ -106,10 +106,9 @@ fn the_bundled_frame_bears_wrong_measurements() {
 fn without_a_flag_the_map_is_the_same_to_the_bit() {
     let scene = procedural(3_000_001, 160, 120).unwrap();
     let mut untouched = 0;
-    for points in [8, 60, 300] {
-        let mut rng = ChaCha8Rng::seed_from_u64(points as u64);
-        let sparse =
-            SparsePattern::Uniform.sample(&scene.rgb, &scene.depth, 160, 120, points, &mut rng).unwrap();
+    for seed in 0..8 {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let sparse = SparsePattern::Uniform.sample(&scene.rgb, &scene.depth, 160, 120, 50, &mut rng).unwrap();
         let (checked, trusted) =
             (run(&scene.rgb, &sparse, Outliers::Ignore), run(&scene.rgb, &sparse, Outliers::Trust));
         assert!(trusted.flagged.is_empty());
@@ -153,7 +152,8 @@ fn where_measurements_lie_far_apart_the_model_is_asked_about_doubtful_ones() {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let clean = SparsePattern::Uniform.sample(&scene.rgb, &scene.depth, 320, 240, 100, &mut rng).unwrap();
         let (bad, chosen) = corrupted(&clean, 0.04, &mut rng);
-        let sparse_plan = CompleteOptions::default().with_plan(QueryPlan::Stride(40));
+        let sparse_plan =
+            CompleteOptions::default().with_plan(QueryPlan::Stride(40)).with_outliers(Outliers::Ignore);
         let done = TINY.complete_detailed(&scene.rgb, &bad, &sparse_plan).unwrap();
         let hit = done.flagged.iter().filter(|o| chosen.contains(&(o.y * 320 + o.x))).count();
         found += hit;

@@ -1,6 +1,6 @@
 //! Which measurements a frame is completed from.
 
-use super::options::{CancelToken, CompleteOptions, Outliers};
+use super::options::{CompleteOptions, Outliers};
 use super::stages::StageSeconds;
 use crate::depth::outliers::{Contradiction, contradictions, without};
 use crate::depth::{SparseDepth, interpolate};
@@ -96,12 +96,9 @@ fn answers_about(
         Query { x: c.pixel % sparse.width(), y: c.pixel / sparse.width(), measured: None, hint }
     };
     let queries: Vec<Query> = doubtful.iter().map(query).collect();
-    let mut progress = |_: usize| !options.cancel.as_ref().is_some_and(CancelToken::is_cancelled);
-    let options = AskOptions {
-        mode: options.answer.as_ref(),
-        max_memory: options.max_memory,
-        progress: Some(&mut progress),
-    };
+    // They are few: a cancellation is seen after the first batch of the plan.
+    let options =
+        AskOptions { mode: options.answer.as_ref(), max_memory: options.max_memory, progress: None };
     ask(model, prefix, &queries, options)
 }
 

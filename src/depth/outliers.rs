@@ -32,8 +32,10 @@ pub struct Outlier {
 
 /// How far outside of its neighbours' range a measurement may lie, in log depth: 7 %.
 const BEYOND: f32 = 0.07;
-/// What the largest difference of colour adds to it.
+/// What the largest difference of colour adds to it; more where neighbours stand side by side and all of them differ, as
+/// they do around a thing of one pixel.
 const COLOUR: f32 = 0.2;
+const COLOUR_IN_A_CROWD: f32 = 1.0;
 /// The difference of colour (Euclidean, 8-bit RGB) from which on it adds no more.
 const OTHER_COLOUR: f32 = 60.0;
 /// Scatter of the whole frame (median difference of a measurement to its neighbours' median, in log depth) up to which its
@@ -49,9 +51,9 @@ const ALONE: f32 = 0.15;
 const ROUNDS: usize = 5;
 /// Fewer measurements than this cannot judge each other.
 const FEWEST: usize = 12;
-/// Reach of the window whose measurements are a pixel's neighbours, where there are [`CROWD`] of them; elsewhere those that the
-/// Delaunay mesh joins to it are.
-const REACH: usize = 2;
+/// Reaches of the windows whose measurements are a pixel's neighbours, the first with a [`CROWD`] of them; where none has, those that
+/// the Delaunay mesh joins to it are.
+const REACHES: [usize; 2] = [2, 4];
 const CROWD: usize = 8;
 /// Points that the scatter of a frame is read from, at most.
 const SAMPLE: usize = 4096;
@@ -170,7 +172,9 @@ fn strays(sparse: &SparseDepth) -> Vec<(usize, bool)> {
 /// Measurements with their neighbours.
 struct Survey<'a> {
     rgb: &'a RgbImage,
-    sparse: &'a SparseDepth,
+    size: (usize, usize),
+    /// Measured pixels, ascending.
+    pixels: Vec<usize>,
     /// Logarithms of the measurements, NaN where there is none.
     logs: Vec<f32>,
     /// Measurements at a hole with the mesh over them, `None` if all have a crowd around them.
@@ -178,35 +182,40 @@ struct Survey<'a> {
 }
 
 impl<'a> Survey<'a> {
-    fn new(rgb: &'a RgbImage, sparse: &'a SparseDepth) -> Result<Self> {
-        let logs = sparse.as_slice().iter().map(|d| d.ln()).collect();
-        let mut survey = Self { rgb, sparse, logs, mesh: None };
-        let alone = |pixel: usize| !survey.logs[pixel].is_nan() && survey.window(pixel).count() < CROWD;
-        if (0..survey.logs.len()).into_par_iter().any(alone) {
+    fn new(rgb: &'a RgbImage, sparse: &SparseDepth) -> Result<Self> {
+        let (size, depth) = ((sparse.width(), sparse.height()), sparse.as_slice());
+        let pixels: Vec<usize> = (0..depth.len()).filter(|&pixel| !depth[pixel].is_nan()).collect();
+        let mut logs = vec![f32::NAN; depth.len()];
+        pixels.iter().for_each(|&pixel| logs[pixel] = depth[pixel].ln());
+        let mut survey = Self { rgb, size, pixels, logs, mesh: None };
+        let alone = |around: &mut Vec<usize>, &pixel: &usize| !survey.crowd(pixel, around);
+        if survey.pixels.par_iter().map_init(Vec::new, alone).any(|alone| alone) {
             let rim = rim(sparse);
             let positions: Vec<_> = rim.iter().map(|&(x, y, _)| (x as f32, y as f32)).collect();
-            let mesh = Mesh::joined(&positions, sparse.width(), sparse.height())?;
-            let pixels = rim.iter().map(|&(x, y, _)| y * sparse.width() + x).collect();
-            survey.mesh = Some((pixels, mesh));
+            let mesh = Mesh::joined(&positions, size.0, size.1)?;
+            survey.mesh = Some((rim.iter().map(|&(x, y, _)| y * size.0 + x).collect(), mesh));
         }
         Ok(survey)
     }
 
-    /// Measured pixels of the window around one.
-    fn window(&self, pixel: usize) -> impl Iterator<Item = usize> + '_ {
-        let width = self.sparse.width();
+    /// Fills `out` with the measured pixels of the window around one; whether they are a crowd.
+    fn crowd(&self, pixel: usize, out: &mut Vec<usize>) -> bool {
+        let (width, height) = self.size;
         let (x, y) = (pixel % width, pixel / width);
-        let columns = x.saturating_sub(REACH)..(x + REACH + 1).min(width);
-        let rows = y.saturating_sub(REACH)..(y + REACH + 1).min(self.sparse.height());
-        let all = rows.flat_map(move |y| columns.clone().map(move |x| y * width + x));
-        all.filter(move |&other| other != pixel && !self.logs[other].is_nan())
+        REACHES.iter().any(|reach| {
+            out.clear();
+            let columns = x.saturating_sub(*reach)..(x + reach + 1).min(width);
+            for row in y.saturating_sub(*reach)..(y + reach + 1).min(height) {
+                let pixels = columns.clone().map(|column| row * width + column);
+                out.extend(pixels.filter(|&other| other != pixel && !self.logs[other].is_nan()));
+            }
+            out.len() >= CROWD
+        })
     }
 
     /// Fills `out` with the neighbours of a measurement; whether they are a crowd.
     fn neighbours(&self, pixel: usize, out: &mut Vec<usize>) -> bool {
-        out.clear();
-        out.extend(self.window(pixel));
-        if out.len() >= CROWD {
+        if self.crowd(pixel, out) {
             return true;
         }
         if let Some((rim, mesh)) = &self.mesh
@@ -220,9 +229,8 @@ impl<'a> Survey<'a> {
 
     /// How far outside of its neighbours' range a measurement of this frame may lie.
     fn threshold(&self) -> f32 {
-        let step = self.sparse.measured().div_ceil(SAMPLE);
-        let pixels: Vec<usize> =
-            (0..self.logs.len()).filter(|&p| !self.logs[p].is_nan()).step_by(step).collect();
+        let step = self.pixels.len().div_ceil(SAMPLE).max(1);
+        let pixels: Vec<usize> = self.pixels.iter().copied().step_by(step).collect();
         let mut off: Vec<f32> = (pixels.par_iter())
             .map_init(Vec::new, |around, &pixel| {
                 self.neighbours(pixel, around);
@@ -236,12 +244,8 @@ impl<'a> Survey<'a> {
     }
 
     fn contradictions(&self, beyond: f32) -> Vec<Contradiction> {
-        (0..self.logs.len())
-            .into_par_iter()
-            .filter(|&pixel| !self.logs[pixel].is_nan())
-            .map_init(Vec::new, |around, pixel| self.judge(pixel, beyond, around))
-            .flatten()
-            .collect()
+        let judge = |around: &mut Vec<usize>, &pixel: &usize| self.judge(pixel, beyond, around);
+        self.pixels.par_iter().map_init(Vec::new, judge).flatten().collect()
     }
 
     fn judge(&self, pixel: usize, beyond: f32, around: &mut Vec<usize>) -> Option<Contradiction> {
@@ -252,19 +256,20 @@ impl<'a> Survey<'a> {
             low = if log < low[0] { [log, low[0]] } else { [low[0], low[1].min(log)] };
             high = if log > high[0] { [log, high[0]] } else { [high[0], high[1].max(log)] };
         }
-        // Of many neighbours one may be wrong itself; of few, one is support enough.
+        // Of a crowd one may be wrong itself; of few, one is support enough.
         let (low, high) = (low[usize::from(crowd)], high[usize::from(crowd)]);
         let over = (own - high).max(low - own);
         // Infinite without neighbours.
         if over <= beyond || !over.is_finite() {
             return None;
         }
-        let excess = over - beyond - COLOUR * self.colour_apart(pixel, around);
+        around.retain(|&n| (self.logs[n] - own).abs() > beyond);
+        let excess = over - beyond - self.colour_apart(pixel, around, crowd);
         if excess <= 0.0 {
             return None;
         }
-        let width = self.sparse.width();
-        let side = width.max(self.sparse.height()) as f32;
+        let width = self.size.0;
+        let side = width.max(self.size.1) as f32;
         let distance = |&n: &usize| {
             let (dx, dy) = ((n % width).abs_diff(pixel % width), (n / width).abs_diff(pixel / width));
             (dx as f32).hypot(dy as f32)
@@ -274,17 +279,24 @@ impl<'a> Survey<'a> {
         Some(Contradiction { pixel, behind: own > high, excess, certain })
     }
 
-    /// Difference of colour to the neighbour that is most alike, 0 to 1.
-    fn colour_apart(&self, pixel: usize, around: &[usize]) -> f32 {
-        let width = self.sparse.width();
-        let colour = |pixel: usize| local_colour(self.rgb, pixel % width, pixel / width);
+    /// What the difference of colour to the one of these neighbours that is most alike adds to the threshold.
+    fn colour_apart(&self, pixel: usize, around: &[usize], crowd: bool) -> f32 {
+        let width = self.size.0;
+        let colour = |pixel: usize| {
+            let (x, y) = (pixel % width, pixel / width);
+            match crowd {
+                true => self.rgb.get_pixel(x as u32, y as u32).0.map(f32::from),
+                false => local_colour(self.rgb, x, y),
+            }
+        };
         let own = colour(pixel);
         let apart = |&n: &usize| {
             let other = colour(n);
             (0..3).map(|c| (own[c] - other[c]).powi(2)).sum::<f32>()
         };
         let least = around.iter().map(apart).fold(f32::INFINITY, f32::min);
-        least.sqrt().min(OTHER_COLOUR) / OTHER_COLOUR
+        let most = if crowd { COLOUR_IN_A_CROWD } else { COLOUR };
+        most * least.sqrt().min(OTHER_COLOUR) / OTHER_COLOUR
     }
 }
 

@@ -133,7 +133,7 @@ impl Room<'_> {
         for _ in 0..count {
             let half = [self.dice.log(0.1, 0.3), self.dice.log(0.08, 0.25), self.dice.log(0.1, 0.3)];
             let at = [self.dice.real(-0.95, 0.95) * w, 0.0, self.dice.real(-0.95, 0.95) * l];
-            let yaw = self.dice.real(0.0, 6.28);
+            let yaw = self.dice.real(0.0, std::f32::consts::TAU);
             let spot = Spot { at, yaw, half: [half[0], half[2]], height: 2.0 * half[1] };
             if !self.plan.fits(&spot, 0.01) {
                 continue;

@@ -99,11 +99,11 @@ impl Room<'_> {
         self.shell.quad([[-w, h, -l], [w, h, -l], [w, h, l], [-w, h, l]], ceiling);
         let skirting = self.dice.chance(0.8).then(|| (trim, self.dice.real(0.05, 0.12)));
         let thick = self.dice.real(0.12, 0.32);
-        for k in 0..4 {
+        for (k, wall) in walls.into_iter().enumerate() {
             let openings: Vec<Opening> =
                 self.holes.iter().filter(|o| o.wall == k).map(|o| o.opening).collect();
             let skirting = skirting.filter(|_| self.kind != Kind::Bathroom);
-            let on = Covering { wall: walls[k], floor, skirting };
+            let on = Covering { wall, floor, skirting };
             self.shell.wall(&self.plan.wall(k), h, &openings, thick, &on);
         }
         for hole in self.holes.clone() {
@@ -214,11 +214,9 @@ impl Room<'_> {
             let tall = model.size()[1];
             let low = [at[0], at[1] - tall, at[2]];
             let piece = Piece { model, at: low, yaw: 0.0, hold: Hold::Ceiling };
-            if self.put(piece).is_some() {
-                if self.lit {
-                    // Below the shade, which would keep its light for itself.
-                    self.lights.push(Light::lamp([at[0], (low[1] - 0.06).max(1.7), at[2]], 0.12, power));
-                }
+            if self.put(piece).is_some() && self.lit {
+                // Below the shade, which would keep its light for itself.
+                self.lights.push(Light::lamp([at[0], (low[1] - 0.06).max(1.7), at[2]], 0.12, power));
             }
             return;
         }

@@ -49,7 +49,7 @@ impl Piece {
     }
 
     /// A place in the room as seen from the piece.
-    fn from_room(&self, p: V3) -> [f32; 2] {
+    fn local(&self, p: V3) -> [f32; 2] {
         let (s, c) = self.yaw.sin_cos();
         let (x, z) = (p[0] - self.at[0], p[2] - self.at[2]);
         [c * x - s * z, s * x + c * z]
@@ -185,7 +185,7 @@ impl Room<'_> {
         depth: f32,
     ) -> Option<usize> {
         let half = self.pieces[table].model.half();
-        let reach = if side % 2 == 0 { half[1] } else { half[0] };
+        let reach = if side.is_multiple_of(2) { half[1] } else { half[0] };
         let turn = side as f32 * 0.25 * TAU;
         for part in [1.0, 0.5, 0.0] {
             let out = reach + seat.half()[1] + 0.02 - depth.max(0.0) * part - depth.min(0.0);
@@ -223,7 +223,7 @@ impl Room<'_> {
             let (cell, pick) = (self.dice.real(0.0, 1.0), self.dice.real(0.0, 1.0));
             let turn = if face { self.dice.real(-0.3, 0.3) } else { self.dice.real(0.0, TAU) };
             let jitter = [self.dice.real(-0.02, 0.02), self.dice.real(-0.02, 0.02)];
-            let Some((middle, boards)) = carrier.model.profile().board_cell(cell) else { return None };
+            let (middle, boards) = carrier.model.profile().board_cell(cell)?;
             let board = boards[((pick * boards.len() as f32) as usize).min(boards.len() - 1)];
             let local = [middle[0] + jitter[0], middle[1] + jitter[1]];
             let room = model.size()[1] + 0.01;
@@ -255,5 +255,5 @@ impl Room<'_> {
 
 /// Whether two pieces whose boxes overlap touch: a seat may be under a table top.
 pub(super) fn tangled(a: &Piece, b: &Piece) -> bool {
-    a.model.profile().clashes(b.from_room(a.at), a.yaw - b.yaw, b.model.profile())
+    a.model.profile().clashes(b.local(a.at), a.yaw - b.yaw, b.model.profile())
 }

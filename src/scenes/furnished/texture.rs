@@ -119,11 +119,11 @@ impl Texture {
 
 /// Pixel left of (above) a coordinate that repeats, and the share of the next one.
 fn split(v: f32, n: u32) -> (u32, f32) {
-    let at = (v - v.floor()) * n as f32 - 0.5;
+    let part = if v.is_finite() { v - v.floor() } else { 0.0 };
+    let at = part * n as f32 - 0.5;
     let at = if at < 0.0 { at + n as f32 } else { at };
-    // A coordinate that is not a number falls on the first pixel.
     let i = (at as u32).min(n - 1);
-    (i, (at - i as f32).max(0.0).min(1.0))
+    (i, (at - i as f32).clamp(0.0, 1.0))
 }
 
 #[cfg(test)]
