@@ -215,7 +215,7 @@ mod tests {
             let answers: Vec<Asked> = (0..asked.len())
                 .map(|i| Asked { depth: 1.0 + (i * 7 % 5) as f32, expected_error: 0.1 })
                 .collect();
-            let wanted = |x: usize, y: usize| (x * 5 + y * 3) % 4 != 0;
+            let wanted = |x: usize, y: usize| !(x * 5 + y * 3).is_multiple_of(4);
             let all = refine_pixels(w, h, s, &answers, usize::MAX, wanted);
             let left = (0..w * h).map(|i| (i % w, i / w)).filter(|p| wanted(p.0, p.1) && !asked.contains(p));
             let mut sorted = all.clone();
