@@ -104,7 +104,7 @@ pub enum DepthFile {
     Png(DepthScale),
 }
 
-/// Writes a frame into the layout of [`FolderDataset`], making the folders where needed.
+/// Writes a frame into the layout of [`Layout::Folder`](super::Layout::Folder), making the folders where needed.
 ///
 /// Fails with [`Error::Io`] or [`Error::Format`] naming the file, and with [`Error::Argument`] for a name with a path
 /// separator.

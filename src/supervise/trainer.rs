@@ -84,7 +84,7 @@ impl Trainer {
     /// files and its state. The steps that follow are those of a run that was never interrupted, bit for bit.
     ///
     /// # Errors
-    /// As [`TrainConfig::load`], [`FreshFiles::load`] and [`store::load_state`].
+    /// As [`TrainConfig::load`]; what the model's files and the state can have wrong, naming the file.
     pub fn resume(dir: &Path) -> Result<Self> {
         let mut trainer = Self::start(TrainConfig::load(dir)?, FreshFiles::load(dir)?, dir)?;
         trainer.progress = store::load_state(dir, &mut trainer.parameters)?;
