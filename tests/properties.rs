@@ -2,7 +2,8 @@
 
 use proptest::collection::vec;
 use proptest::prelude::*;
-use sdim::internals::query::number::{DigitReader, read_bins};
+use sdim::internals::query::bins::{Bins, Spacing};
+use sdim::internals::query::number::DigitReader;
 use sdim::internals::query::plan::{lattice, stride_within};
 use sdim::internals::query::prompt::choose_evenly;
 use sdim::internals::vlm::qwen2_5::preprocess::PreprocessorConfig;
@@ -40,10 +41,13 @@ proptest! {
 
     #[test]
     fn any_distribution_gives_a_depth_in_range(logits in vec(-80f32..80.0, 2..300), range in 0.1f64..10.0) {
-        let r = read_bins(&logits, range);
-        prop_assert!(r.value >= 0.0 && f64::from(r.value) <= range * 1.0001);
-        prop_assert!((0.0..=1.0).contains(&r.confidence));
-        prop_assert!(r.expected_error >= 0.0 && f64::from(r.expected_error) <= range);
+        let lowest = range / 50.0;
+        for (spacing, least) in [(Spacing::Equal { range }, 0.0), (Spacing::Ratio { lowest, highest: range }, lowest)] {
+            let r = Bins { count: logits.len(), spacing }.read(&logits, &mut Vec::new());
+            prop_assert!(f64::from(r.value) >= least * 0.9999 && f64::from(r.value) <= range * 1.0001);
+            prop_assert!((0.0..=1.0).contains(&r.confidence) && r.expected_error >= 0.0);
+            prop_assert!(least > 0.0 || f64::from(r.expected_error) <= range);
+        }
     }
 
     #[test]

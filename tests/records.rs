@@ -9,7 +9,6 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 use sdim::internals::model::{CheckpointFiles, SdimModel};
 use sdim::internals::query::PromptWriter;
-use sdim::internals::query::number::read_bins;
 use sdim::internals::supervise::{
     Asking, BatchConfig, BinLoss, Example, RecordConfig, RecordSet, Shard, Target, VERSION, bins, example_of,
     frame, held_out_seed, training_seed,
@@ -84,6 +83,7 @@ fn the_crate_reads_records_as_the_trainer_does() {
     let shard = Shard::read(&fixture("000000.safetensors")).unwrap();
     let expected = candle_core::safetensors::load(fixture("expected.safetensors"), &Device::Cpu).unwrap();
     let (mut all, mut targets) = (Vec::new(), Vec::new());
+    let of = model.prompts.numbers().format.bins().unwrap();
     for frame in 0..shard.dims.frames {
         for variant in 0..shard.dims.variants {
             let example = shard.example((&model).into(), frame, variant).unwrap();
@@ -95,16 +95,16 @@ fn the_crate_reads_records_as_the_trainer_does() {
             let (rows, medians): (Vec<Vec<f32>>, Vec<f32>) =
                 (at("logits").to_vec2().unwrap(), at("median").to_vec1().unwrap());
             for (row, median) in rows.iter().zip(medians) {
-                let answer = read_bins(row, 1.25).value;
+                let answer = of.read(row, &mut Vec::new()).value;
                 assert!((answer - median).abs() < 1e-4, "{answer} is {median} in PyTorch");
             }
-            targets.extend(example.items.iter().map(|i| Target { value: i.value, largest: i.largest }));
+            targets.extend(example.items.iter().map(|i| Target { value: i.value, scale: i.scale }));
             all.push(found);
         }
     }
     // The blur of a tenth of the schedule, as in the generator.
     let widen = 1.0 + 7.0 * (1.0 - 0.1 / 0.25);
-    let config = BinLoss { range: 1.25, blur: 0.0015 * widen, blur_slope: 0.008 * widen, l1: 4.0 };
+    let config = BinLoss { bins: of, blur: 0.0015 * widen, blur_slope: 0.008 * widen, l1: 4.0 };
     let parts = bins(&Tensor::cat(&all, 0).unwrap(), targets, config).unwrap();
     let value = |name: &str| expected[name].to_vec1::<f32>().unwrap()[0];
     let total = parts.total.to_scalar::<f32>().unwrap();
@@ -156,7 +156,7 @@ fn what_is_read_from_a_shard_is_what_the_trainer_makes() {
     for (read, made) in read.items.iter().zip(&made.items) {
         assert_eq!(read.tokens, made.tokens);
         assert_eq!((read.supervised, &read.answer), (made.supervised, &made.answer));
-        assert_eq!((read.value, read.hint, read.largest), (made.value, made.hint, made.largest));
+        assert_eq!((read.value, read.hint, read.scale), (made.value, made.hint, made.scale));
     }
 }
 

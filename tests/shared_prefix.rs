@@ -9,7 +9,8 @@ use sdim::SparseDepth;
 use sdim::internals::kernels::Block;
 use sdim::internals::model::{AskOptions, Prefix, SdimModel, ask};
 use sdim::internals::query::Query;
-use sdim::internals::query::number::{DigitReader, Reading, read_bins};
+use sdim::internals::query::Reading;
+use sdim::internals::query::number::DigitReader;
 use sdim::internals::query::prompt::Tokens;
 use sdim::internals::supervise::FreshFiles;
 use sdim::internals::vlm::qwen2_5::cache::KvCache;
@@ -141,7 +142,10 @@ impl Setup {
         let metres =
             |r: Reading| Reading { value: r.value * unit, expected_error: r.expected_error * unit, ..r };
         match numbers.format {
-            NumberFormat::Bins { range, .. } => metres(read_bins(&self.logits(&self.alone(&tokens)), range)),
+            NumberFormat::Bins { .. } | NumberFormat::LogBins { .. } => {
+                let bins = numbers.format.bins().unwrap();
+                metres(bins.read(&self.logits(&self.alone(&tokens)), &mut Vec::new()))
+            }
             NumberFormat::Digits { decimals, integers } => {
                 let mut reader = DigitReader::new(decimals, integers);
                 let mut next = self.prefix.space.next + self.text_tokens.unwrap_or(tokens.len()) as f32;

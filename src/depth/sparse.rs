@@ -129,6 +129,14 @@ impl SparseDepth {
     pub fn max(&self) -> Option<f32> {
         self.points().map(|(_, _, d)| d).reduce(f32::max)
     }
+
+    /// The measurement in the middle of all by size, the larger of two, metres; `None` without any.
+    pub fn median(&self) -> Option<f32> {
+        let mut depths: Vec<f32> = self.points().map(|(_, _, d)| d).collect();
+        let middle = depths.len() / 2;
+        let inside = middle < depths.len();
+        inside.then(|| *depths.select_nth_unstable_by(middle, f32::total_cmp).1)
+    }
 }
 
 fn check_range(x: usize, y: usize, value: f32) -> Result<()> {

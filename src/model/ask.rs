@@ -7,9 +7,10 @@ use super::sdim_model::SdimModel;
 use crate::error::{Error, Result};
 use crate::kernels;
 use crate::query::Query;
+use crate::query::Reading;
 use crate::query::grammar::AnswerGrammar;
 use crate::query::mode::{AnswerMode, Generation};
-use crate::query::number::{DigitReader, NumberFormat, Reading, read_bins_with};
+use crate::query::number::{DigitReader, NumberFormat};
 use crate::query::prompt::Tokens;
 use crate::query::settings::PixelReference;
 use rayon::prelude::*;
@@ -171,12 +172,10 @@ fn in_batches<T: Clone + Send>(
 /// The number that each item is made to say, in number units: its words are forced, its tokens chosen among numbers.
 fn forced_numbers(batch: &mut Batch) -> Result<Vec<Reading>> {
     let numbers = batch.model.prompts.numbers();
-    let (decimals, integers) = match numbers.format {
-        NumberFormat::Bins { range, .. } => {
-            return batch.of_numbers(Vec::new, |scratch, row| read_bins_with(row, range, scratch));
-        }
-        NumberFormat::Digits { decimals, integers } => (decimals, integers),
-    };
+    if let Some(bins) = numbers.format.bins() {
+        return batch.of_numbers(Vec::new, |scratch, row| bins.read(row, scratch));
+    }
+    let NumberFormat::Digits { decimals, integers } = numbers.format else { return Ok(Vec::new()) };
     let items = batch.sequences.count();
     let mut readers = vec![DigitReader::new(decimals, integers); items];
     let mut alive = vec![true; items];

@@ -13,8 +13,8 @@ use image::RgbImage;
 use rayon::prelude::*;
 
 impl SdimModel {
-    /// Resizes a frame and scatters its measurements: pixels, and `[1, h, w, 1]` in number units with 0 where nothing
-    /// was measured.
+    /// Resizes a frame and scatters its measurements: pixels, and `[1, h, w, 1]` of what the fusion block sees of a number, with 0
+    /// where nothing was measured.
     ///
     /// # Errors
     /// [`Error::SizeMismatch`], [`Error::ImageSize`].
@@ -26,7 +26,8 @@ impl SdimModel {
         }
         let pixels = self.preprocessor.resize(rgb)?;
         let (w, h) = (pixels.resized.width() as usize, pixels.resized.height() as usize);
-        let scattered = scatter(sparse, w, h, self.prompts.unit(sparse));
+        let unit = self.prompts.unit(sparse);
+        let scattered = scatter(sparse, w, h, |depth| self.prompts.seen(depth, unit));
         Ok((pixels, Tensor::from_vec(scattered, (1, h, w, 1), &self.device)?))
     }
 
@@ -102,9 +103,9 @@ impl SdimModel {
     }
 }
 
-/// Moves measurements to the pixels of the resized frame, in units of `unit` metres, 0 elsewhere. Where several fall on
+/// Moves measurements to the pixels of the resized frame, each as what is `seen` of its metres, 0 elsewhere. Where several fall on
 /// one pixel, the one nearest to its centre stays: nothing is averaged or interpolated.
-pub fn scatter(sparse: &SparseDepth, width: usize, height: usize, unit: f32) -> Vec<f32> {
+pub fn scatter(sparse: &SparseDepth, width: usize, height: usize, seen: impl Fn(f32) -> f32) -> Vec<f32> {
     let mut out = vec![0f32; width * height];
     let mut off = vec![f32::MAX; width * height];
     let (sx, sy) = (width as f32 / sparse.width() as f32, height as f32 / sparse.height() as f32);
@@ -114,7 +115,7 @@ pub fn scatter(sparse: &SparseDepth, width: usize, height: usize, unit: f32) -> 
         let distance = (fx.fract() - 0.5).powi(2) + (fy.fract() - 0.5).powi(2);
         if distance < off[at] {
             off[at] = distance;
-            out[at] = depth / unit;
+            out[at] = seen(depth);
         }
     }
     out

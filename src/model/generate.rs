@@ -5,7 +5,8 @@ use super::sdim_model::SdimModel;
 use crate::error::{Error, Result};
 use crate::query::grammar::AnswerGrammar;
 use crate::query::mode::Generation;
-use crate::query::number::{CONFIDENT_WITHIN, NumberFormat, Reading};
+use crate::query::number::NumberFormat;
+use crate::query::reading::{CONFIDENT_WITHIN, Reading};
 use crate::vlm::chat::tokenizer::Tokenizer;
 use candle_core::{DType, Device, Tensor};
 use candle_transformers::utils::apply_repeat_penalty;
@@ -50,7 +51,7 @@ impl<'a> TokenChooser<'a> {
         let numbers = model.prompts.numbers();
         let digits = match numbers.format {
             NumberFormat::Digits { .. } => numbers.ids.first_chunk().copied(),
-            NumberFormat::Bins { .. } => None,
+            NumberFormat::Bins { .. } | NumberFormat::LogBins { .. } => None,
         };
         let Some(digits) = digits else {
             return Err(Error::argument("answer mode", "generate", "a checkpoint that writes digits"));

@@ -2,12 +2,14 @@
 //!
 //! Nothing here holds weights: a loaded checkpoint asks in `model`.
 
+pub mod bins;
 pub mod grammar;
 pub mod marker;
 pub mod mode;
 pub mod number;
 pub mod plan;
 pub mod prompt;
+pub mod reading;
 pub mod settings;
 pub mod template;
 mod unit;
@@ -15,8 +17,9 @@ mod unit;
 pub use grammar::{AnswerGrammar, parse_depth};
 pub use marker::{Marker, MarkerShape};
 pub use mode::{AnswerMode, Generation};
-pub use number::{DepthUnit, NumberFormat, Reading};
+pub use number::{DepthUnit, NumberFormat};
 pub use plan::QueryPlan;
 pub use prompt::{FrameSpace, PromptWriter, Query};
+pub use reading::Reading;
 pub use settings::{Hint, MeasurementPrompt, PixelReference, Settings};
 pub use template::PromptTemplate;

@@ -74,14 +74,11 @@ impl AnswerMode {
         check(
             matches!(number, NumberFormat::Digits { .. }),
             "answer_mode.kind",
-            "\"generate\", but number.kind is \"bins\"".into(),
+            "\"generate\", but numbers are bins".into(),
             "number.kind \"digits\", since only digits can be read from words",
         )?;
         let named = template.answer_unit();
-        let counted = match unit {
-            DepthUnit::FrameMax => None,
-            unit => Some(f64::from(unit.metres(1.0))),
-        };
+        let counted = unit.metres().map(f64::from);
         // A sentence in metres around a number that counts something else would be read as metres.
         let agree = named.is_none_or(|n| counted.is_some_and(|c| (c - n).abs() < 1e-6));
         check(

@@ -1,7 +1,9 @@
 //! Numbers as tokens: how a depth is written into a prompt, and how an answer is read from logits.
 
+use super::bins::{Bins, Spacing};
+use super::reading::{CONFIDENT_WITHIN, Reading};
+use crate::depth::SparseDepth;
 use crate::error::{Error, Result};
-use crate::kernels::bin_stats;
 use crate::vlm::chat::tokenizer::Tokenizer;
 
 /// What the number 1 means in prompts and answers.
@@ -16,17 +18,28 @@ pub enum DepthUnit {
     Millimetres,
     /// The frame's largest measurement.
     FrameMax,
+    /// The median of the frame's measurements, which a few wrong ones do not move.
+    FrameMedian,
 }
 
 impl DepthUnit {
-    /// Metres of the number 1 in a frame whose largest measurement is `largest` metres.
-    pub fn metres(self, largest: f32) -> f32 {
+    /// Metres of the number 1 where it is the same in every frame.
+    pub fn metres(self) -> Option<f32> {
         match self {
-            Self::Metres => 1.0,
-            Self::Centimetres => 0.01,
-            Self::Millimetres => 0.001,
-            Self::FrameMax => largest,
+            Self::Metres => Some(1.0),
+            Self::Centimetres => Some(0.01),
+            Self::Millimetres => Some(0.001),
+            Self::FrameMax | Self::FrameMedian => None,
         }
+    }
+
+    /// Metres of the number 1 in a frame with these measurements; 1 where the frame decides but has none.
+    pub fn metres_in(self, sparse: &SparseDepth) -> f32 {
+        let decided = match self {
+            Self::FrameMedian => sparse.median(),
+            _ => sparse.max(),
+        };
+        self.metres().or(decided).unwrap_or(1.0)
     }
 }
 
@@ -40,6 +53,16 @@ pub enum NumberFormat {
         bins: usize,
         /// Upper end of the last bin, in [`DepthUnit`]s.
         range: f64,
+    },
+    /// One token per depth bin, `<|d0|>` to `<|d{bins-1}|>`, from `lowest` to `highest` units, each wider than the one before it
+    /// by the same factor: as fine near as far, and a frame of 2 m and a street of 100 m have room.
+    LogBins {
+        /// Number of bins.
+        bins: usize,
+        /// Lower end of the first bin, in [`DepthUnit`]s, above 0.
+        lowest: f64,
+        /// Upper end of the last bin, in [`DepthUnit`]s.
+        highest: f64,
     },
     /// Decimal digits, one token each, with a fixed number of decimals ("4.230").
     Digits {
@@ -62,25 +85,6 @@ pub struct Numbers {
 /// Index of the decimal point among the rows of a [`NumberFormat::Digits`] head.
 pub const POINT: usize = 10;
 
-/// An answer in units of the frame.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Reading {
-    /// Median of the distribution; NaN if nothing could be read.
-    pub value: f32,
-    /// Probability that the truth lies within 5 % of `value`, as the model sees it; in 0..=1, higher is surer.
-    pub confidence: f32,
-    /// Expected absolute error, same unit as `value`.
-    pub expected_error: f32,
-}
-
-impl Reading {
-    /// No readable number.
-    pub const INVALID: Self = Self { value: f32::NAN, confidence: 0.0, expected_error: f32::NAN };
-}
-
-/// Half-width of the interval whose probability is the confidence, relative to the answer.
-pub(crate) const CONFIDENT_WITHIN: f32 = 0.05;
-
 impl NumberFormat {
     /// Checks the sizes of a configuration.
     ///
@@ -95,6 +99,12 @@ impl NumberFormat {
                 (2..=100_000).contains(&bins) && range.is_finite() && range > 0.0,
                 "2 to 100000 bins over a positive range",
             ),
+            NumberFormat::LogBins { bins, lowest, highest } => (
+                "number.bins",
+                format!("{bins} bins from {lowest} to {highest}"),
+                (2..=100_000).contains(&bins) && lowest > 0.0 && lowest < highest && highest.is_finite(),
+                "2 to 100000 bins from a positive number to a larger one",
+            ),
             NumberFormat::Digits { decimals, integers } => (
                 "number.decimals",
                 format!("{integers}.{decimals}"),
@@ -104,6 +114,18 @@ impl NumberFormat {
         };
         if ok { Ok(()) } else { Err(Error::config(file, key, found, expected)) }
     }
+
+    /// The bins, where numbers are bins.
+    #[doc(hidden)]
+    pub fn bins(&self) -> Option<Bins> {
+        match *self {
+            Self::Bins { bins, range } => Some(Bins { count: bins, spacing: Spacing::Equal { range } }),
+            Self::LogBins { bins, lowest, highest } => {
+                Some(Bins { count: bins, spacing: Spacing::Ratio { lowest, highest } })
+            }
+            Self::Digits { .. } => None,
+        }
+    }
 }
 
 impl Numbers {
@@ -112,13 +134,9 @@ impl Numbers {
     /// # Errors
     /// [`Error::Tokenizer`] names a token that the vocabulary lacks.
     pub fn new(format: NumberFormat, tokenizer: &Tokenizer) -> Result<Self> {
-        let ids = match format {
-            NumberFormat::Bins { bins, .. } => {
-                (0..bins).map(|k| tokenizer.id(&bin_token(k))).collect::<Result<_>>()?
-            }
-            NumberFormat::Digits { .. } => {
-                "0123456789.".chars().map(|c| tokenizer.id(&c.to_string())).collect::<Result<_>>()?
-            }
+        let ids = match format.bins() {
+            Some(bins) => (0..bins.count).map(|k| tokenizer.id(&bin_token(k))).collect::<Result<_>>()?,
+            None => "0123456789.".chars().map(|c| tokenizer.id(&c.to_string())).collect::<Result<_>>()?,
         };
         Ok(Self { format, ids })
     }
@@ -127,9 +145,8 @@ impl Numbers {
     pub fn write(&self, value: f32) -> Vec<usize> {
         let value = if value.is_nan() { 0.0 } else { value };
         match self.format {
-            NumberFormat::Bins { bins, range } => {
-                let k = (f64::from(value) / range * bins as f64).floor();
-                vec![(k.max(0.0) as usize).min(bins - 1)]
+            NumberFormat::Bins { .. } | NumberFormat::LogBins { .. } => {
+                self.format.bins().map(|b| b.bin(value)).into_iter().collect()
             }
             NumberFormat::Digits { decimals, integers } => {
                 let limit = 10f64.powi(integers as i32) - 10f64.powi(-(decimals as i32));
@@ -138,6 +155,18 @@ impl Numbers {
                     .map(|b| if b == b'.' { POINT } else { usize::from(b - b'0') })
                     .collect()
             }
+        }
+    }
+
+    /// What the fusion block sees of a measured number, above 0: the number itself; its place among bins of equal ratio, as a
+    /// share of them, so that no measurement is far from the others.
+    pub fn seen(&self, value: f32) -> f32 {
+        match self.format {
+            NumberFormat::LogBins { .. } => self.format.bins().map_or(value, |bins| {
+                let count = bins.count as f64;
+                (bins.position(value).max(1.0) / count) as f32
+            }),
+            _ => value,
         }
     }
 
@@ -150,21 +179,6 @@ impl Numbers {
 /// Name of a bin's token.
 pub fn bin_token(bin: usize) -> String {
     format!("<|d{bin}|>")
-}
-
-/// Reads one distribution over bins that cover 0 to `range`.
-pub fn read_bins(logits: &[f32], range: f64) -> Reading {
-    read_bins_with(logits, range, &mut Vec::new())
-}
-
-/// As [`read_bins`], with a buffer to use again.
-pub fn read_bins_with(logits: &[f32], range: f64, scratch: &mut Vec<f32>) -> Reading {
-    let width = (range / logits.len() as f64) as f32;
-    // At least one bin's width, or a sharp answer of a near pixel could never be confident.
-    match bin_stats(logits, scratch, |median| (median * CONFIDENT_WITHIN).max(1.0)) {
-        Some(s) => Reading { value: s.median * width, confidence: s.near, expected_error: s.spread * width },
-        None => Reading::INVALID,
-    }
 }
 
 /// Reads a number from its digits' distributions as they were chosen one after the other.
@@ -256,21 +270,6 @@ impl DigitReader {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn bins_give_median_error_and_confidence() {
-        let mut logits = vec![-30.0f32; 1000];
-        logits[400] = 5.0;
-        let r = read_bins(&logits, 1.25);
-        assert!((r.value - 400.5 * 0.00125).abs() < 1e-5, "{r:?}");
-        assert!(r.confidence > 0.999 && r.expected_error < 1e-4);
-        logits[800] = 5.0 - (3.0f32).ln();
-        let r = read_bins(&logits, 1.25);
-        assert!((r.value - 0.5).abs() < 2e-3 && (r.confidence - 0.75).abs() < 1e-3);
-        assert!((r.expected_error - 0.125).abs() < 2e-3, "{r:?}");
-        logits[3] = f32::NAN;
-        assert!(read_bins(&logits, 1.25).value.is_nan());
-    }
 
     #[test]
     fn digits_follow_the_grammar() {

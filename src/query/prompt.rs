@@ -1,6 +1,6 @@
 //! From a frame to tokens: the shared prefix, and one suffix per asked pixel.
 
-use super::number::{NumberFormat, Numbers};
+use super::number::{DepthUnit, NumberFormat, Numbers};
 use super::settings::{MeasurementPrompt, PixelReference, Settings};
 use crate::depth::SparseDepth;
 use crate::error::{Error, Result};
@@ -215,7 +215,12 @@ impl PromptWriter {
 
     /// Metres per number unit of a frame.
     pub fn unit(&self, sparse: &SparseDepth) -> f32 {
-        self.settings.unit.metres(sparse.max().unwrap_or(1.0))
+        self.settings.unit.metres_in(sparse)
+    }
+
+    /// What the fusion block sees of a measurement in metres, where the number 1 is `unit` metres.
+    pub(crate) fn seen(&self, depth: f32, unit: f32) -> f32 {
+        self.numbers.seen(depth / unit)
     }
 
     /// The shared prefix: text, image placeholders, text, measurements; and the frame's space.
@@ -267,7 +272,11 @@ impl PromptWriter {
             unit: self.unit(sparse),
         };
         if let MeasurementPrompt::Prefix { max } = self.settings.measurements {
-            for (x, y, depth) in with_largest(choose_evenly(sparse, max.min(points), seed), sparse) {
+            let mut told = choose_evenly(sparse, max.min(points), seed);
+            if self.settings.unit == DepthUnit::FrameMax {
+                told = with_largest(told, sparse);
+            }
+            for (x, y, depth) in told {
                 tokens.push_at(&self.numbers.write_ids(depth / space.unit), (x, y), MEASURED_TIME, &space);
             }
         }
@@ -334,7 +343,7 @@ impl PromptWriter {
                 // As many decimals as the answer has.
                 let decimals = match self.numbers.format {
                     NumberFormat::Digits { decimals, .. } => decimals,
-                    NumberFormat::Bins { .. } => 3,
+                    NumberFormat::Bins { .. } | NumberFormat::LogBins { .. } => 3,
                 };
                 t.mask_measured.replace("{x}", &format!("{:.decimals$}", depth / space.unit))
             }

@@ -5,7 +5,7 @@ use crate::depth::{SparseDepth, SparsePattern};
 use crate::error::{Error, Result};
 use crate::model::{SdimModel, scatter};
 use crate::query::prompt::Tokens;
-use crate::query::{PromptWriter, Query};
+use crate::query::{DepthUnit, PromptWriter, Query};
 use crate::scenes::sensor::{CameraModel, DepthSensor};
 use crate::scenes::{RgbdFrame, procedural};
 use crate::vlm::chat::tokenizer::Tokenizer;
@@ -68,7 +68,7 @@ impl Default for BatchConfig {
 pub struct Example {
     /// The frame as the encoder reads it.
     pub pixels: Pixels,
-    /// Scattered measurements in number units, row-major.
+    /// Scattered measurements as the fusion block sees them, row-major.
     pub scattered: Vec<f32>,
     /// Metres per number unit.
     pub unit: f32,
@@ -90,9 +90,9 @@ pub struct Item {
     pub value: f32,
     /// What interpolation of the measurements says here, in number units.
     pub hint: f32,
-    /// The frame's largest measurement in number units: what its errors are counted in, so that frames of near and of
-    /// far things weigh alike.
-    pub largest: f32,
+    /// What the frame's errors are counted in, in number units, so that frames of near and of far things weigh alike: its
+    /// largest measurement, or twice the median where numbers are counted in the median.
+    pub scale: f32,
 }
 
 /// Mixes a run's seed with a counter, so that neighbouring streams share nothing.
@@ -215,7 +215,10 @@ pub fn written(
     let points: Vec<(f32, f32)> = prompted.points().map(|(x, y, _)| (x as f32, y as f32)).collect();
     let values: Vec<f32> = prompted.points().map(|p| p.2).collect();
     let interpolator = Interpolator::new(&points, width, height)?;
-    let largest = prompted.max().unwrap_or(space.unit) / space.unit;
+    let scale = match writer.settings().unit {
+        DepthUnit::FrameMedian => 2.0,
+        _ => prompted.max().unwrap_or(space.unit) / space.unit,
+    };
     let mut items = Vec::with_capacity(asked.len());
     for &(x, y, depth) in asked {
         let hint = interpolator.at(x as f32, y as f32, &values);
@@ -230,10 +233,10 @@ pub fn written(
             p += 1.0;
         }
         let (supervised, hint) = (answer.len(), hint / space.unit);
-        items.push(Item { tokens, supervised, answer, value, hint, largest });
+        items.push(Item { tokens, supervised, answer, value, hint, scale });
     }
     items.sort_by_key(|i| i.tokens.len());
-    let scattered = scatter(prompted, width, height, space.unit);
+    let scattered = scatter(prompted, width, height, |depth| writer.seen(depth, space.unit));
     let pixels = Pixels { resized: rgb.clone(), grid };
     Ok(Example { pixels, scattered, unit: space.unit, prefix, items })
 }

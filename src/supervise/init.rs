@@ -6,7 +6,7 @@ use crate::error::{Error, Result};
 use crate::files::{read_text, write_tensors, write_whole};
 use crate::model::{CheckpointFiles, SETTINGS, SdimModel, initial};
 use crate::query::Settings;
-use crate::query::number::{NumberFormat, Numbers};
+use crate::query::number::Numbers;
 use crate::vlm::checkpoint::weights::Weights;
 use crate::vlm::files::{CONFIG, PREPROCESSOR, TOKENIZER};
 use candle_core::{Device, Tensor};
@@ -41,10 +41,7 @@ impl FreshFiles {
     /// # Errors
     /// [`Error::Config`] names the key whose size does not fit; [`Error::Format`] if a part cannot be written as JSON.
     pub fn of(shape: &Shape, settings: &Settings) -> Result<Self> {
-        let numbers = match settings.number {
-            NumberFormat::Bins { bins, .. } => bins,
-            NumberFormat::Digits { .. } => 0,
-        };
+        let numbers = settings.number.bins().map_or(0, |bins| bins.count);
         let text = |what: &str, value: &Value| {
             serde_json::to_string_pretty(value).map_err(|e| Error::format(what, e.to_string(), "JSON"))
         };

@@ -6,7 +6,6 @@ use super::batch::{
 use super::shard::{About, Dims, Shard, VERSION};
 use crate::depth::SparsePattern;
 use crate::error::{Error, Result};
-use crate::query::number::NumberFormat;
 use crate::query::{Hint, MeasurementPrompt, PixelReference};
 use crate::scenes::RgbdFrame;
 use rand::Rng;
@@ -83,7 +82,7 @@ impl RecordConfig {
         for (key, fits) in [
             ("pixel_reference", matches!(s.pixel_reference, PixelReference::Pointer { .. })),
             ("measurements", matches!(s.measurements, MeasurementPrompt::Prefix { .. })),
-            ("number", matches!(s.number, NumberFormat::Bins { .. })),
+            ("number", s.number.bins().is_some()),
             ("hint", s.hint == Hint::Linear),
             ("template.query", s.template.query == "{pixel}" && s.template.forced().is_empty()),
             ("fusion", s.fusion.is_some()),

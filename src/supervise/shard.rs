@@ -9,10 +9,10 @@
 //! | `rgb` | u8 `[n, h, w, 3]` | the frame as the encoder reads it |
 //! | `seed` | u64 `[n]` | seed of the scene |
 //! | `unit` | f32 `[n, v]` | metres per number unit |
-//! | `largest` | f32 `[n, v]` | the largest measurement |
+//! | `scale` | f32 `[n, v]` | what errors are counted in |
 //! | `measured_start` | u32 `[n v + 1]` | where a variant's entries of the next two begin, and the last one's end |
 //! | `measured_pixel` | u32 `[m]` | `y w + x` of each measurement that the fusion block sees |
-//! | `measured_value` | f32 `[m]` | its value |
+//! | `measured_value` | f32 `[m]` | what the fusion block sees of it |
 //! | `told_count` | u16 `[n, v]` | measurements in the prompt |
 //! | `told_id`, `told_x`, `told_y` | u16 `[n, v, p]` | their token and pixel, in the order of the prompt; 0 after the last one |
 //! | `asked_id`, `asked_x`, `asked_y` | u16 `[n, v, q]` | a question's token (its hint as a number) and pixel |
@@ -35,7 +35,7 @@ use std::collections::HashMap;
 use std::path::Path;
 
 /// The version of the format that this crate writes and reads.
-pub const VERSION: u32 = 1;
+pub const VERSION: u32 = 2;
 /// The metadata's key.
 const KEY: &str = "sdim_records";
 
@@ -80,7 +80,7 @@ pub struct Shard {
     pub rgb: Vec<u8>,
     pub seed: Vec<u64>,
     pub unit: Vec<f32>,
-    pub largest: Vec<f32>,
+    pub scale: Vec<f32>,
     pub measured_start: Vec<u32>,
     pub measured_pixel: Vec<u32>,
     pub measured_value: Vec<f32>,
@@ -105,7 +105,7 @@ impl Shard {
             rgb: Vec::with_capacity(dims.frames * dims.height * dims.width * 3),
             seed: Vec::new(),
             unit: f32s(),
-            largest: f32s(),
+            scale: f32s(),
             measured_start: vec![0],
             measured_pixel: Vec::new(),
             measured_value: f32s(),
@@ -145,7 +145,7 @@ impl Shard {
 
     fn push_variant(&mut self, example: &Example) -> Result<()> {
         self.unit.push(example.unit);
-        self.largest.push(example.items.first().map_or(1.0, |i| i.largest));
+        self.scale.push(example.items.first().map_or(1.0, |i| i.scale));
         for (i, &value) in example.scattered.iter().enumerate().filter(|(_, v)| **v != 0.0) {
             self.measured_pixel.push(i as u32);
             self.measured_value.push(value);
@@ -194,7 +194,7 @@ impl Shard {
             ("rgb", Dtype::U8, &[d.frames, d.height, d.width, 3], self.rgb.clone()),
             ("seed", Dtype::U64, &[d.frames], bytes(&self.seed, u64::to_le_bytes)),
             ("unit", Dtype::F32, &variants, f32s(&self.unit)),
-            ("largest", Dtype::F32, &variants, f32s(&self.largest)),
+            ("scale", Dtype::F32, &variants, f32s(&self.scale)),
             ("measured_start", Dtype::U32, &[self.measured_start.len()], u32s(&self.measured_start)),
             ("measured_pixel", Dtype::U32, &measured, u32s(&self.measured_pixel)),
             ("measured_value", Dtype::F32, &measured, f32s(&self.measured_value)),
@@ -251,7 +251,7 @@ impl Shard {
             rgb: reader.take("rgb", Dtype::U8, &[n, height, width, 3], u8::from_le_bytes)?,
             seed: reader.take("seed", Dtype::U64, &[n], u64::from_le_bytes)?,
             unit: f32s("unit", &nv)?,
-            largest: f32s("largest", &nv)?,
+            scale: f32s("scale", &nv)?,
             measured_start: u32s("measured_start", n.saturating_mul(variants).saturating_add(1))?,
             measured_pixel: u32s("measured_pixel", measured)?,
             measured_value: f32s("measured_value", &[measured])?,
@@ -342,8 +342,8 @@ impl Shard {
         tokens.push_at(&[self.asked_id[i].into()], pixel, QUERY_TIME, space);
         let value = self.asked_value[i];
         let answer = asking.prompts.numbers().write(value);
-        let (hint, largest) = (self.asked_hint[i], self.largest[at]);
-        Item { tokens, supervised: 1, answer, value, hint, largest }
+        let (hint, scale) = (self.asked_hint[i], self.scale[at]);
+        Item { tokens, supervised: 1, answer, value, hint, scale }
     }
 }
 

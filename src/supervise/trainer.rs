@@ -11,7 +11,8 @@ use crate::error::{Error, Result};
 use crate::fusion::{BatchStats, Normalise};
 use crate::kernels;
 use crate::model::{SETTINGS, SdimModel};
-use crate::query::number::{NumberFormat, POINT};
+use crate::query::bins::Bins;
+use crate::query::number::POINT;
 use crate::query::{AnswerMode, PixelReference, Settings};
 use crate::vlm::checkpoint::weights::Weights;
 use candle_core::Device;
@@ -24,7 +25,7 @@ pub struct StepReport {
     pub step: usize,
     /// Loss.
     pub loss: f32,
-    /// Mean absolute error of the expected number, as a share of its frame's largest measurement.
+    /// Mean absolute error of the expected number, in what its frame's errors are counted in.
     pub l1: f32,
     /// Norm of the gradients before clipping.
     pub gradient: f32,
@@ -263,10 +264,10 @@ impl Trainer {
     }
 
     /// Blur of the targets: wide at first, so that near misses teach, then narrow.
-    fn bin_loss(&self, range: f64) -> BinLoss {
+    fn bin_loss(&self, bins: Bins) -> BinLoss {
         let progress = self.progress.step as f32 / (0.25 * self.config.steps as f32).max(1.0);
         let widen = 1.0 + 7.0 * (1.0 - progress).max(0.0);
-        BinLoss { range, blur: 0.0015 * widen, blur_slope: 0.008 * widen, l1: self.config.l1 }
+        BinLoss { bins, blur: 0.0015 * widen, blur_slope: 0.008 * widen, l1: self.config.l1 }
     }
 
     /// Loss of all examples in one pass.
@@ -274,19 +275,19 @@ impl Trainer {
         let normalise = stats.map_or(Normalise::Running, Normalise::Batch);
         let logits = pass::logits(&self.model, examples, normalise)?;
         let items = || examples.iter().flat_map(|e| &e.items);
-        match self.model.prompts.numbers().format {
-            NumberFormat::Bins { range, .. } => {
-                let targets = items().map(|i| Target { value: i.value, largest: i.largest });
-                loss::bins(&logits, targets.collect(), self.bin_loss(range))
+        match self.model.prompts.numbers().format.bins() {
+            Some(bins) => {
+                let targets = items().map(|i| Target { value: i.value, scale: i.scale });
+                loss::bins(&logits, targets.collect(), self.bin_loss(bins))
             }
-            NumberFormat::Digits { .. } => {
+            None => {
                 let (mut chosen, mut place, mut number) = (vec![], vec![], vec![]);
                 for (n, item) in items().enumerate() {
                     let point = item.answer.iter().position(|&c| c == POINT).unwrap_or(item.answer.len());
                     for (i, &c) in item.answer.iter().enumerate() {
                         let exponent = point as i32 - i as i32 - i32::from(i < point);
                         chosen.push(c as u32);
-                        place.push(if c == POINT { 0.0 } else { 10f32.powi(exponent) / item.largest });
+                        place.push(if c == POINT { 0.0 } else { 10f32.powi(exponent) / item.scale });
                         number.push(n as u32);
                     }
                 }

@@ -2,7 +2,7 @@
 
 use super::super::optimiser::Parameter;
 use super::*;
-use crate::query::DepthUnit;
+use crate::query::{DepthUnit, NumberFormat};
 use candle_core::Tensor;
 use std::collections::HashMap;
 
@@ -55,10 +55,10 @@ fn the_model_that_is_trained_is_the_one_that_its_values_load_as() {
 }
 
 #[test]
-fn errors_in_metres_are_counted_in_the_largest_measurement() {
+fn errors_are_counted_in_the_largest_measurement_or_in_medians() {
     let tiny = Trainer::new(small(), &Settings::tiny()).unwrap();
     let examples = tiny.make_batch(0).unwrap();
-    assert!(examples[0].items.iter().all(|i| i.largest == 1.0), "it is the frame's own unit");
+    assert!(examples[0].items.iter().all(|i| i.scale == 2.0), "two medians");
     let metres = Settings {
         unit: DepthUnit::Metres,
         number: NumberFormat::Bins { bins: 1000, range: 100.0 },
@@ -68,12 +68,12 @@ fn errors_in_metres_are_counted_in_the_largest_measurement() {
     for settings in [metres, digits] {
         let trainer = Trainer::new(small(), &settings).unwrap();
         let mut examples = trainer.make_batch(0).unwrap();
-        let largest = examples[0].items[0].largest;
+        let scale = examples[0].items[0].scale;
         let measured = examples[0].scattered.iter().fold(0f32, |m, v| m.max(*v));
-        assert!(largest == measured && largest != 1.0, "{largest} m, {measured} m");
+        assert!(scale == measured && scale != 1.0, "{scale} m, {measured} m");
         let once = trainer.loss(&examples, None).unwrap().l1;
         for item in examples.iter_mut().flat_map(|e| &mut e.items) {
-            item.largest *= 2.0;
+            item.scale *= 2.0;
         }
         let half = trainer.loss(&examples, None).unwrap().l1;
         assert!((once - 2.0 * half).abs() < 1e-6 * once, "{once}, {half} of twice as far a frame");

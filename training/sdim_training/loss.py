@@ -10,16 +10,19 @@ def blur(progress):
 
 
 def bin_loss(logits, batch, config, blur, slope, l1_weight):
-    """Cross-entropy with a blurred target plus L1 on the expected number, which is counted in the frame's largest
-    measurement; mean over questions. Returns the loss and the L1."""
-    width, centres = config.range / config.bins, config.centres(logits.device)
-    target = batch.value.clamp(0.5 * width, config.range - 0.5 * width)[..., None]
-    sigma = (blur + slope * target).clamp(min=0.5 * width)
-    blurred = (-0.5 * ((centres - target) / sigma) ** 2).softmax(-1)
+    """Cross-entropy with a blurred target plus L1 on the expected number, counted in the frame's scale; mean over questions.
+    Returns the loss and the L1."""
+    middles, scale = config.middles(logits.device), batch.scale[:, None, None]
+    place = config.position(batch.value).clamp(0.5, config.bins - 0.5)[..., None]
+    target = config.number(place)
+    # Bins of equal ratio are blurred alike near and far.
+    sigma = torch.full_like(place, blur + slope) if config.ratio else blur * scale + slope * target
+    sigma = (sigma / config.width).clamp(min=0.5)
+    blurred = (-0.5 * ((middles - place) / sigma) ** 2).softmax(-1)
     log_p = logits.log_softmax(-1)
     cross_entropy = -(blurred * log_p).sum(-1).mean()
-    expected = (log_p.exp() * centres).sum(-1, keepdim=True)
-    l1 = ((expected - target).abs() / batch.largest[:, None, None]).mean()
+    expected = (log_p.exp() * config.number(middles)).sum(-1, keepdim=True)
+    l1 = ((expected - target).abs() / scale).mean()
     return cross_entropy + l1_weight * l1, l1.detach()
 
 
@@ -30,4 +33,4 @@ def median(logits, config):
     high = cumulative.gather(-1, k)
     low = torch.where(k > 0, cumulative.gather(-1, (k - 1).clamp(min=0)), 0.0)
     inside = ((0.5 - low) / (high - low).clamp(min=1e-12)).clamp(0, 1)
-    return ((k + inside) * (config.range / config.bins)).squeeze(-1).float()
+    return config.number(k + inside).squeeze(-1).float()

@@ -5,6 +5,7 @@ head) is derived here in every forward pass, so that what is trained is what wil
 """
 
 import json
+import math
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,7 +22,7 @@ class Batch(NamedTuple):
     """`b` frames, each with room for `p` measurements in the prompt and `q` questions. Numbers are in number units."""
 
     rgb: Tensor  # u8 [b, h, w, 3]
-    depth: Tensor  # f32 [b, h, w]: measurements at their pixels, 0 elsewhere
+    depth: Tensor  # f32 [b, h, w]: what the fusion block sees of measurements at their pixels, 0 elsewhere
     told_id: Tensor  # i64 [b, p]
     told_at: Tensor  # f32 [b, p, 2]: column and row
     told_count: Tensor  # i64 [b]
@@ -29,7 +30,7 @@ class Batch(NamedTuple):
     asked_at: Tensor  # f32 [b, q, 2]
     hint: Tensor  # f32 [b, q]
     value: Tensor  # f32 [b, q]: the true answers
-    largest: Tensor  # f32 [b]
+    scale: Tensor  # f32 [b]: what errors are counted in
 
 
 class Config:
@@ -43,7 +44,7 @@ class Config:
         self.vision, number, fusion = self.text["vision_config"], self.sdim["number"], self.sdim["fusion"]
         wanted = {
             "tie_word_embeddings": self.text["tie_word_embeddings"] is True,
-            "sdim.json, number": number["kind"] == "bins",
+            "sdim.json, number": number["kind"] in ("bins", "log_bins"),
             "sdim.json, pixel_reference": self.sdim["pixel_reference"]["kind"] == "pointer",
             "sdim.json, hint": self.sdim["hint"] == "linear",
             "sdim.json, fusion": fusion is not None,
@@ -53,7 +54,11 @@ class Config:
             if not fits:
                 raise ValueError(f"{directory}: {key} is not the way of asking that can be trained here")
         self.fusion = (fusion["branch"], fusion["high"], fusion["low"])
-        self.bins, self.range, self.glimpse = number["bins"], number["range"], self.sdim["glimpse"]
+        self.bins, self.glimpse = number["bins"], self.sdim["glimpse"]
+        self.ratio = number["kind"] == "log_bins"
+        self.lowest = number["lowest"] if self.ratio else 0.0
+        # Of a bin: in number units, or of the number's logarithm.
+        self.width = (math.log(number["highest"] / self.lowest) if self.ratio else number["range"]) / self.bins
         self.scale = self.sdim["position_scale"]
         self.mean, self.std = image["image_mean"], image["image_std"]
         added = {t["content"]: t["id"] for t in read("tokenizer.json")["added_tokens"]}
@@ -63,9 +68,18 @@ class Config:
         if added[f"<|d{self.bins - 1}|>"] != self.first_number + self.bins - 1:
             raise ValueError(f"{directory}: number tokens do not follow each other")
 
-    def centres(self, device=None):
-        """The middle of each bin."""
-        return (torch.arange(self.bins, device=device) + 0.5) * (self.range / self.bins)
+    def number(self, position):
+        """The number at a position among the bins; bin k covers k to k + 1 (`src/query/bins.rs`)."""
+        return self.lowest * (position * self.width).exp() if self.ratio else position * self.width
+
+    def position(self, number):
+        """The position of a number, those out of range at the ends."""
+        position = (number.clamp(min=1e-30) / self.lowest).log() if self.ratio else number
+        return (position / self.width).clamp(0, self.bins)
+
+    def middles(self, device=None):
+        """Positions of the middle of each bin."""
+        return torch.arange(self.bins, device=device) + 0.5
 
 
 class RmsNorm(nn.Module):

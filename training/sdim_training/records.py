@@ -12,7 +12,7 @@ from safetensors import safe_open
 
 from .model import Batch
 
-VERSION = 1
+VERSION = 2
 
 
 class Shard:
@@ -59,7 +59,7 @@ def assemble(samples, pin=False):
     depth[mirrored] = depth[mirrored][..., ::-1]
     batch = dict(depth=depth, told_at=at("told"), asked_at=at("asked"), hint=stack["asked_hint"])
     batch |= {k: stack[k].astype(np.int64) for k in ("told_id", "told_count", "asked_id")}
-    batch |= dict(value=stack["asked_value"], largest=stack["largest"])
+    batch |= dict(value=stack["asked_value"], scale=stack["scale"])
     batch = {k: torch.from_numpy(v) for k, v in batch.items()}
     batch["rgb"] = torch.stack([s.rgb[frame].flip(1) if m else s.rgb[frame] for s, frame, _, m in samples])
     return Batch(**{k: v.pin_memory() if pin else v for k, v in batch.items()})
