@@ -87,6 +87,20 @@ impl DepthCompleter {
 
     /// Completes a frame: Z-depth in metres for each pixel, with a confidence.
     ///
+    /// ```
+    /// use sdim::{CompleteOptions, DepthCompleter, QueryPlan, RgbImage, SparseDepth};
+    /// # #[cfg(feature = "tiny")] {
+    /// let completer = DepthCompleter::tiny()?;
+    /// let rgb = RgbImage::new(64, 48);
+    /// let sparse = SparseDepth::from_points(64, 48, &[(5, 5, 2.0), (60, 8, 2.5), (30, 40, 1.2)])?;
+    /// let options = CompleteOptions::default().with_plan(QueryPlan::Stride(8));
+    /// let map = completer.complete(&rgb, &sparse, &options)?;
+    /// assert_eq!(map.get(60, 8), Some(2.5), "measured pixels keep their measurement");
+    /// assert!(map.depth().iter().all(|d| *d > 0.0), "metres, row-major");
+    /// # }
+    /// # Ok::<(), sdim::Error>(())
+    /// ```
+    ///
     /// # Errors
     /// [`Error::SizeMismatch`]; [`Error::ImageSize`] on a side under 28 pixels or an aspect ratio over 200;
     /// [`Error::NoMeasurement`]; [`Error::Config`] if the answer mode does not go with the checkpoint or the frame is too small

@@ -10,6 +10,20 @@ use super::pixels::{check_length, is_valid, pixel_count};
 use crate::error::{Error, Result};
 
 /// Measured depth at some pixels of a frame, in metres (Z-depth), NaN where nothing was measured.
+///
+/// ```
+/// use sdim::{DepthScale, SparseDepth};
+/// // From pixels with their depth in metres; from a map, in which 0 or NaN means "not measured".
+/// let points = SparseDepth::from_points(640, 480, &[(12, 30, 1.5), (600, 470, 2.25)])?;
+/// let map = SparseDepth::new(4, 1, vec![0.0, 1.5, f32::NAN, 2.0])?;
+/// assert_eq!((points.measured(), map.measured()), (2, 2));
+/// // A sensor's integers have a unit that must be named: here 1 is a millimetre.
+/// let raw: [u16; 4] = [0, 1500, 0, 2000];
+/// let scale = DepthScale::millimetres();
+/// let same = SparseDepth::new(4, 1, raw.iter().map(|&v| scale.metres(v)).collect())?;
+/// assert_eq!(same.get(3, 0), map.get(3, 0));
+/// # Ok::<(), sdim::Error>(())
+/// ```
 #[derive(Debug, Clone)]
 pub struct SparseDepth {
     width: usize,

@@ -17,6 +17,17 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 /// An adapter in memory.
+///
+/// ```no_run
+/// use sdim::{Adapter, DepthCompleter, LoadOptions};
+/// use std::path::Path;
+/// // A look into one, and a checkpoint that is loaded with it.
+/// let adapter = Adapter::load(Path::new("my-adapter"))?;
+/// println!("{} tensors, numbers {:?}", adapter.tensors.len(), adapter.settings.number);
+/// let options = LoadOptions::default().with_adapter("my-adapter");
+/// let completer = DepthCompleter::load("Qwen2.5-VL-3B-Instruct", &options)?;
+/// # Ok::<(), sdim::Error>(())
+/// ```
 #[derive(Debug, Clone)]
 pub struct Adapter {
     /// `sdim.json`
