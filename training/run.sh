@@ -35,8 +35,9 @@ pack() {
     else
         echo "NOTE: a program that needs this machine's C library or a newer one: $(ldd --version | head -n 1)"
     fi
-    cargo build --release --example records --example furniture --target "$host"
-    local built=${CARGO_TARGET_DIR:-target}/$host/release/examples
+    local built=${CARGO_TARGET_DIR:-target}/$host/release/examples examples=(--example records)
+    [ -z "${FURNITURE:-}" ] || examples+=(--example furniture)
+    cargo build --release "${examples[@]}" --target "$host"
     cp "$built/records" "$stage/bin/"
     strip "$stage/bin/records"
     cp -r "$here/sdim_training" "$here/run.sh" "$stage/"
