@@ -4,6 +4,7 @@
 //! records --fresh fresh --shape small                                   # a checkpoint to start from
 //! records --shape small --size 384x288 --prompt 512 --count 60000 --seconds 300 --out train
 //! records --shape small --size 384x288 --prompt 512 --count 256 --held-out 100 --out held/100
+//! records --mix procedural=0.5,furnished=0.35,streets=0.15 --library furniture --out mixed
 //! ```
 //!
 //! A set is a folder of shards (`src/supervise/shard.rs`) and `records.json`, which says how it was drawn. The same
@@ -15,7 +16,10 @@ use anyhow::{Context, bail, ensure};
 use clap::Parser;
 use indicatif::{ProgressBar, ProgressStyle};
 use sdim::internals::query::PromptWriter;
-use sdim::internals::supervise::{Asking, BatchConfig, FreshFiles, RecordConfig, RecordSet, Shape};
+use sdim::internals::supervise::{
+    Asking, BatchConfig, FreshFiles, RecordConfig, RecordSet, SceneMix, Scenes, Shape,
+};
+use sdim::scenes::furnished::Library;
 use sdim::settings::Settings;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -62,6 +66,12 @@ struct Args {
     /// Fewest and most measurements of a frame: FEWEST,MOST.
     #[arg(long, value_delimiter = ',', num_args = 1, default_value = "40,1500")]
     points: Vec<usize>,
+    /// Which scenes: shares of procedural, furnished and streets, NAME=SHARE,...; procedural alone without it.
+    #[arg(long)]
+    mix: Option<SceneMix>,
+    /// Folder of furniture for furnished rooms, as it was installed or packed. Held-out records have models of their own.
+    #[arg(long)]
+    library: Option<PathBuf>,
     /// Scenes that are never trained on, with exactly so many uniform measurements.
     #[arg(long, value_name = "POINTS")]
     held_out: Option<usize>,
@@ -118,6 +128,7 @@ fn config(args: &Args) -> anyhow::Result<RecordConfig> {
         prompt_points: args.prompt,
         points: (fewest, most),
         sizes: args.sizes.clone(),
+        mix: args.mix.unwrap_or_default(),
         ..Default::default()
     };
     let set = match args.held_out {
@@ -127,6 +138,15 @@ fn config(args: &Args) -> anyhow::Result<RecordConfig> {
     // Held-out scenes are the same for any seed of training's.
     let (seed, variants) = if args.held_out.is_some() { (0, 1) } else { (args.seed, args.variants) };
     Ok(RecordConfig { batch, variants, seed, set })
+}
+
+fn scenes(args: &Args, config: &RecordConfig) -> anyhow::Result<Scenes> {
+    let mut scenes = Scenes::new(config.batch.mix);
+    if let Some(dir) = args.library.as_ref().filter(|_| config.batch.mix.furnished > 0.0) {
+        scenes = scenes.with_library(&Library::open(dir)?, config.held_out())?;
+    }
+    scenes.check(config.held_out()).context("--mix")?;
+    Ok(scenes)
 }
 
 /// Refuses a folder that holds other records.
@@ -148,6 +168,7 @@ fn write(args: &Args, files: &FreshFiles, out: &Path) -> anyhow::Result<()> {
     let asking = Asking { config: &parsed.config, prompts: &prompts, tokenizer: &parsed.tokenizer };
     let config = config(args)?;
     config.check(asking)?;
+    let scenes = scenes(args, &config)?;
     claim(out, &config)?;
     let start = Instant::now();
     let (mut made, mut bytes, mut said) = (0u64, 0u64, start);
@@ -165,7 +186,7 @@ fn write(args: &Args, files: &FreshFiles, out: &Path) -> anyhow::Result<()> {
         }
         let path = out.join(format!("{index:06}.safetensors"));
         if !path.exists() {
-            config.shard(asking, index)?.write(&path)?;
+            config.shard(asking, &scenes, index)?.write(&path)?;
             made += args.shard as u64;
         }
         bytes += path.metadata().with_context(|| path.display().to_string())?.len();

@@ -10,8 +10,8 @@ use rand_chacha::rand_core::SeedableRng;
 use sdim::internals::model::{CheckpointFiles, SdimModel};
 use sdim::internals::query::PromptWriter;
 use sdim::internals::supervise::{
-    Asking, BatchConfig, BinLoss, Example, RecordConfig, RecordSet, Shard, Target, VERSION, bins, example_of,
-    frame, held_out_seed, training_seed,
+    Asking, BatchConfig, BinLoss, Example, RecordConfig, RecordSet, SceneMix, Scenes, Shard, Target, VERSION,
+    bins, example_of, frame, held_out_seed, training_seed,
 };
 use sdim::internals::vlm::qwen2_5::decoder::Keep;
 use sdim::internals::vlm::qwen2_5::sequences::Sequences;
@@ -53,6 +53,11 @@ fn config() -> RecordConfig {
         ..Default::default()
     };
     RecordConfig { batch, variants: 2, seed: 3, set: RecordSet::Train }
+}
+
+/// Procedural scenes alone.
+fn plain() -> Scenes {
+    Scenes::new(SceneMix::default())
 }
 
 /// Logits of an example's questions, `[questions, bins]`, computed as for a user's frame.
@@ -115,12 +120,12 @@ fn the_crate_reads_records_as_the_trainer_does() {
 #[test]
 fn a_shard_follows_from_its_seed_and_is_read_back() {
     let writer = Writer::new(|_| {});
-    let shard = config().shard(writer.asking(), 5).unwrap();
+    let shard = config().shard(writer.asking(), &plain(), 5).unwrap();
     let one = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
-    assert_eq!(one.install(|| config().shard(writer.asking(), 5)).unwrap(), shard, "on one thread");
-    let other = RecordConfig { seed: 4, ..config() }.shard(writer.asking(), 5).unwrap();
+    assert_eq!(one.install(|| config().shard(writer.asking(), &plain(), 5)).unwrap(), shard, "on one thread");
+    let other = RecordConfig { seed: 4, ..config() }.shard(writer.asking(), &plain(), 5).unwrap();
     assert!(other.rgb != shard.rgb && other.seed != shard.seed);
-    assert_ne!(config().shard(writer.asking(), 6).unwrap().seed, shard.seed);
+    assert_ne!(config().shard(writer.asking(), &plain(), 6).unwrap().seed, shard.seed);
 
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("000005.safetensors");
@@ -137,9 +142,9 @@ fn what_is_read_from_a_shard_is_what_the_trainer_makes() {
     // A set of one frame with one variant, so that its example can be made beside it.
     let mut config = config();
     (config.batch.frames, config.variants) = (1, 1);
-    let shard = config.shard(writer.asking(), 0).unwrap();
+    let shard = config.shard(writer.asking(), &plain(), 0).unwrap();
     let size = (shard.dims.width, shard.dims.height);
-    let frame = frame(shard.seed[0], size).unwrap();
+    let frame = frame(&plain(), shard.seed[0], size).unwrap();
     let base = sdim::internals::supervise::mix(config.seed, 0);
     let found = (0..9).find_map(|tries| {
         let random = sdim::internals::supervise::mix(base, tries);
@@ -165,7 +170,7 @@ fn held_out_scenes_are_the_same_for_any_number_of_points_and_never_trained_on() 
     let writer = Writer::new(|_| {});
     let held = |points, grid| {
         let config = RecordConfig { set: RecordSet::HeldOut { points, grid }, variants: 1, ..config() };
-        config.shard(writer.asking(), 0).unwrap()
+        config.shard(writer.asking(), &plain(), 0).unwrap()
     };
     let (few, many) = (held(10, None), held(30, Some(4)));
     assert_eq!((&few.seed, &few.rgb), (&many.seed, &many.rgb));
@@ -181,7 +186,14 @@ fn held_out_scenes_are_the_same_for_any_number_of_points_and_never_trained_on() 
         assert!(held_out_seed(random) >= 1 << 63);
     }
     assert!(few.seed.iter().all(|&s| s >= 1 << 63));
-    assert!(config().shard(writer.asking(), 0).unwrap().seed.iter().all(|s| (1 << 62..1 << 63).contains(s)));
+    assert!(
+        config()
+            .shard(writer.asking(), &plain(), 0)
+            .unwrap()
+            .seed
+            .iter()
+            .all(|s| (1 << 62..1 << 63).contains(s))
+    );
 }
 
 #[test]
@@ -190,7 +202,7 @@ fn what_records_cannot_hold_is_refused() {
     let refused = |change: fn(&mut RecordConfig), name: &str| {
         let mut config = config();
         change(&mut config);
-        match config.shard(writer.asking(), 0) {
+        match config.shard(writer.asking(), &plain(), 0) {
             Err(Error::Argument { name: found, .. }) => assert_eq!(found, name),
             other => panic!("{name}: {:?}", other.map(|s| s.dims)),
         }
@@ -202,7 +214,7 @@ fn what_records_cannot_hold_is_refused() {
     refused(|c| c.batch.questions = 0, "questions");
     refused(|c| c.set = RecordSet::HeldOut { points: 0, grid: None }, "held-out set");
     let unhinted = Writer::new(|s| s.hint = Hint::None);
-    match config().shard(unhinted.asking(), 0) {
+    match config().shard(unhinted.asking(), &plain(), 0) {
         Err(Error::Config { key, .. }) => assert_eq!(key, "hint"),
         other => panic!("{:?}", other.map(|s| s.dims)),
     }

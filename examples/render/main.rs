@@ -3,17 +3,19 @@
 //! `cargo run --release --example render -- --out DIR --count N [--recipe RECIPE] [--library DIR] [--seed S] [--width W]
 //! [--height H] [--points P | --rings R] [--sheet FILE]`
 //!
-//! Recipes: `procedural` (the default), `furnished` (rooms of the models in `--library`, see `scripts/furniture.sh`) and
-//! `street-lidar` (streets from a car, to be measured with `--rings`).
+//! Recipes: `procedural` (the default), `furnished` (rooms of the models in `--library`, see `scripts/furniture.sh`),
+//! `street-lidar` (streets from a car, to be measured with `--rings`) and `training` (what models are trained on: frames of
+//! `--mix` with the measurements that are told, bad ones among them).
 
 mod sheet;
 
-use anyhow::Context;
+use anyhow::{Context, bail};
 use clap::{Parser, ValueEnum};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use sdim::benchmarks::{DepthFile, write_frame};
 use sdim::depth::{io, sample_points};
+use sdim::internals::supervise::{self, BatchConfig, SceneMix, Scenes, mix, told_and_asked, training_seed};
 use sdim::scenes::furnished::{Library, Split, furnished};
 use sdim::scenes::{RgbdFrame, SpinningLidar, procedural, street};
 use sdim::{DepthScale, SparseDepth};
@@ -33,6 +35,9 @@ struct Args {
     /// Folder of furniture, as it was installed or packed.
     #[arg(long, required_if_eq("recipe", "furnished"))]
     library: Option<PathBuf>,
+    /// Shares of the scenes of `--recipe training`: procedural, furnished and streets, NAME=SHARE,...
+    #[arg(long, default_value = "procedural=1")]
+    mix: SceneMix,
     /// Which models and rooms.
     #[arg(long, value_enum, default_value_t = Part::All)]
     split: Part,
@@ -61,6 +66,7 @@ enum Recipe {
     Procedural,
     Furnished,
     StreetLidar,
+    Training,
 }
 
 #[derive(Clone, Copy, ValueEnum)]
@@ -72,9 +78,8 @@ enum Part {
 
 impl Args {
     fn library(&self) -> anyhow::Result<Option<Library>> {
-        let Some(dir) = self.library.as_ref().filter(|_| self.recipe == Recipe::Furnished) else {
-            return Ok(None);
-        };
+        let furnished = [Recipe::Furnished, Recipe::Training].contains(&self.recipe);
+        let Some(dir) = self.library.as_ref().filter(|_| furnished) else { return Ok(None) };
         let split = match self.split {
             Part::All => Split::All,
             Part::Train => Split::Train,
@@ -83,8 +88,27 @@ impl Args {
         Ok(Some(Library::open(dir)?.part(split)?))
     }
 
+    /// A frame and its measurements.
+    fn made(&self, library: Option<&Library>, seed: u64) -> anyhow::Result<(RgbdFrame, Option<SparseDepth>)> {
+        if self.recipe != Recipe::Training {
+            let frame = self.frame(library, seed)?;
+            let measured = self.measured(&frame, seed)?;
+            return Ok((frame, measured));
+        }
+        let mut scenes = Scenes::new(self.mix);
+        if let Some(library) = library {
+            scenes = scenes.with_library(library, false)?;
+        }
+        scenes.check(false).context("--mix")?;
+        let mut frame = supervise::frame(&scenes, training_seed(mix(seed, 0)), (self.width, self.height))?;
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let (told, _) = told_and_asked(&mut frame, &BatchConfig::default(), None, &mut rng)?;
+        Ok((frame, Some(told)))
+    }
+
     fn frame(&self, library: Option<&Library>, seed: u64) -> anyhow::Result<RgbdFrame> {
         Ok(match self.recipe {
+            Recipe::Training => bail!("--recipe training: made with its measurements"),
             Recipe::Procedural => procedural(seed, self.width, self.height)?,
             Recipe::StreetLidar => street(seed, self.width, self.height)?,
             Recipe::Furnished => {
@@ -111,8 +135,7 @@ fn main() -> anyhow::Result<()> {
     let library = args.library()?;
     let mut sheet = args.sheet.as_ref().map(|_| sheet::Sheet::new(args.count, args.width, args.height));
     for seed in args.seed..args.seed + args.count {
-        let frame = args.frame(library.as_ref(), seed)?;
-        let measured = args.measured(&frame, seed)?;
+        let (frame, measured) = args.made(library.as_ref(), seed)?;
         if let Some(sheet) = &mut sheet {
             sheet.add(&frame, measured.as_ref())?;
         }

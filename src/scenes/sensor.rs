@@ -158,6 +158,9 @@ impl DepthSensor {
         let median = *seen.select_nth_unstable_by(middle, f32::total_cmp).1;
         let largest = seen.iter().copied().fold(median, f32::max);
         let mut out = vec![f32::NAN; depth.len()];
+        let bounds = (self.edge_holes > 0.0 || self.mixed > 0.0)
+            .then(|| surroundings(depth, width))
+            .unwrap_or_default();
         for y in 0..height {
             for x in 0..width {
                 let shifted = |v: usize, by: i32, size: usize| {
@@ -168,15 +171,16 @@ impl DepthSensor {
                 if !(clean.is_finite() && clean > 0.0) {
                     continue;
                 }
-                let (low, high) = around(depth, (width, height), (sx, sy));
+                let (low, high) = bounds.get(sy * width + sx).copied().unwrap_or((clean, clean));
                 let at_edge = high > EDGE_RATIO * low;
                 if at_edge && rng.random::<f32>() < self.edge_holes {
                     continue;
                 }
-                let brightness =
-                    rgb.get_pixel(sx as u32, sy as u32).0.iter().map(|&v| f32::from(v)).sum::<f32>() / 765.0;
-                if brightness < self.dark {
-                    continue;
+                if self.dark > 0.0 {
+                    let sum: f32 = rgb.get_pixel(sx as u32, sy as u32).0.iter().map(|&v| f32::from(v)).sum();
+                    if sum / 765.0 < self.dark {
+                        continue;
+                    }
                 }
                 let seen = match at_edge && rng.random::<f32>() < self.mixed {
                     true => low + (high - low) * rng.random::<f32>(),
@@ -204,18 +208,23 @@ impl DepthSensor {
     }
 }
 
-/// Smallest and largest valid depth of a pixel and its eight neighbours.
-fn around(depth: &[f32], (width, height): (usize, usize), (x, y): (usize, usize)) -> (f32, f32) {
-    let mut bounds = (f32::INFINITY, 0f32);
-    for v in y.saturating_sub(1)..=(y + 1).min(height - 1) {
-        for u in x.saturating_sub(1)..=(x + 1).min(width - 1) {
-            let d = depth[v * width + u];
-            if d.is_finite() && d > 0.0 {
-                bounds = (bounds.0.min(d), bounds.1.max(d));
-            }
+/// Smallest and largest valid depth of each pixel and its eight neighbours: of rows of three, then of columns of three.
+fn surroundings(depth: &[f32], width: usize) -> Vec<(f32, f32)> {
+    let own = |d: f32| if d.is_finite() && d > 0.0 { (d, d) } else { (f32::INFINITY, 0.0) };
+    let join = |a: (f32, f32), b: (f32, f32)| (a.0.min(b.0), a.1.max(b.1));
+    let mut rows: Vec<(f32, f32)> = Vec::with_capacity(depth.len());
+    for row in depth.chunks_exact(width) {
+        for (x, &d) in row.iter().enumerate() {
+            let before = own(row[x.saturating_sub(1)]);
+            rows.push(join(join(own(d), before), own(row[(x + 1).min(width - 1)])));
         }
     }
-    bounds
+    (0..rows.len())
+        .map(|i| {
+            let above = if i >= width { rows[i - width] } else { rows[i] };
+            join(join(rows[i], above), rows.get(i + width).copied().unwrap_or(rows[i]))
+        })
+        .collect()
 }
 
 /// About normal, mean 0, variance 1: the sum of four uniform values, which costs no logarithm per pixel.

@@ -1,13 +1,15 @@
 //! From a seed to a training batch: frames, measurements, questions and their true answers.
 
+use super::asked::questions;
+use super::measure::{measure, spoil};
+use super::mix::{SceneMix, Scenes};
+use crate::depth::SparseDepth;
 use crate::depth::interpolate::Interpolator;
-use crate::depth::{SparseDepth, SparsePattern};
 use crate::error::{Error, Result};
 use crate::model::{SdimModel, scatter};
 use crate::query::prompt::Tokens;
 use crate::query::{DepthUnit, PromptWriter, Query};
-use crate::scenes::sensor::{CameraModel, DepthSensor};
-use crate::scenes::{RgbdFrame, procedural};
+use crate::scenes::RgbdFrame;
 use crate::vlm::chat::tokenizer::Tokenizer;
 use crate::vlm::qwen2_5::config::VlmConfig;
 use crate::vlm::qwen2_5::grid::Grid;
@@ -48,6 +50,15 @@ pub struct BatchConfig {
     /// Share of the frames that pass through a random camera and depth sensor; labels stay clean.
     #[serde(default)]
     pub sensors: f32,
+    /// Share of the frames among whose measurements are bad ones: saturated, gross errors, left-overs at the border.
+    #[serde(default)]
+    pub errors: f32,
+    /// Share of the questions that are drawn near depth edges; the others are drawn from all known pixels.
+    #[serde(default)]
+    pub edges: f32,
+    /// Which scenes the frames show.
+    #[serde(default)]
+    pub mix: SceneMix,
 }
 
 impl Default for BatchConfig {
@@ -60,6 +71,9 @@ impl Default for BatchConfig {
             labels: LabelSource::Dense,
             sizes: vec![(256, 192), (256, 192), (224, 224), (272, 160), (320, 144), (192, 256)],
             sensors: 0.6,
+            errors: 0.35,
+            edges: 0.3,
+            mix: SceneMix::default(),
         }
     }
 }
@@ -117,8 +131,11 @@ pub fn held_out_seed(random: u64) -> u64 {
 /// Makes the examples of one step, in parallel; the same seed and step give the same batch.
 ///
 /// # Errors
-/// Errors of the prompt writer; a frame without any return is replaced by the next seed's.
+/// Errors of the prompt writer; a frame without any return is replaced by the next seed's. [`Error::Argument`] for a mix with
+/// furnished rooms, for which there is no furniture here.
 pub fn make(model: &SdimModel, config: &BatchConfig, seed: u64, step: u64) -> Result<Vec<Example>> {
+    let scenes = Scenes::new(config.mix);
+    scenes.check(false)?;
     let size = config.sizes[(mix(seed ^ 0x51CE, step) % config.sizes.len() as u64) as usize];
     (0..config.frames as u64)
         .into_par_iter()
@@ -126,7 +143,7 @@ pub fn make(model: &SdimModel, config: &BatchConfig, seed: u64, step: u64) -> Re
             let base = mix(seed, step * config.frames as u64 + i);
             let mut tries = 0;
             loop {
-                match example(model, config, mix(base, tries), size) {
+                match example(model, config, &scenes, mix(base, tries), size) {
                     Err(_) if tries < 8 => tries += 1,
                     other => return other,
                 }
@@ -152,19 +169,26 @@ impl<'a> From<&'a SdimModel> for Asking<'a> {
     }
 }
 
-/// The frame of a seed, as it is trained on: a scene, mirrored and recoloured. All training data come from here.
+/// The frame of a seed, as it is trained on: a scene of the mix, mirrored and recoloured. All training data come from here.
 ///
 /// # Errors
 /// Errors of the scenes.
-pub fn frame(seed: u64, size: (usize, usize)) -> Result<RgbdFrame> {
-    let mut frame = procedural(seed, size.0, size.1)?;
+pub fn frame(scenes: &Scenes, seed: u64, size: (usize, usize)) -> Result<RgbdFrame> {
+    let place = (mix(seed, 2) >> 40) as f32 / (1u64 << 24) as f32;
+    let mut frame = scenes.render(seed, place, size)?;
     augment(&mut frame, &mut ChaCha8Rng::seed_from_u64(mix(seed, 1)));
     Ok(frame)
 }
 
-fn example(model: &SdimModel, config: &BatchConfig, seed: u64, size: (usize, usize)) -> Result<Example> {
+fn example(
+    model: &SdimModel,
+    config: &BatchConfig,
+    scenes: &Scenes,
+    seed: u64,
+    size: (usize, usize),
+) -> Result<Example> {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let frame = frame(training_seed(rng.random()), size)?;
+    let frame = frame(scenes, training_seed(rng.random()), size)?;
     example_of(model.into(), config, &frame, &mut rng)
 }
 
@@ -178,14 +202,48 @@ pub fn example_of(
     frame: &RgbdFrame,
     rng: &mut ChaCha8Rng,
 ) -> Result<Example> {
+    example_again(asking, config, frame, None, rng)
+}
+
+/// Measures a frame once more and asks about it; `picture` is what a camera made of it the first time.
+///
+/// # Errors
+/// As [`example_of`].
+pub(super) fn example_again(
+    asking: Asking,
+    config: &BatchConfig,
+    frame: &RgbdFrame,
+    picture: Option<&RgbImage>,
+    rng: &mut ChaCha8Rng,
+) -> Result<Example> {
     let mut frame = frame.clone();
-    let measured = measure(&mut frame, config, rng)?;
-    let (prompted, held_back) = match config.labels {
+    let (told, asked) = told_and_asked(&mut frame, config, picture, rng)?;
+    written(asking, &frame.rgb, &told, config.prompt_points, &asked, rng.random())
+}
+
+/// Pixels to ask with their true depths, metres.
+pub(super) type Asked = Vec<(usize, usize, f32)>;
+
+/// Measures a frame, which a random camera may have taken afterwards unless there is a `picture` of it. What is told may be wrong, what is asked is not.
+///
+/// # Errors
+/// [`crate::Error::NoMeasurement`] if nothing can be measured.
+pub fn told_and_asked(
+    frame: &mut RgbdFrame,
+    config: &BatchConfig,
+    picture: Option<&RgbImage>,
+    rng: &mut ChaCha8Rng,
+) -> Result<(SparseDepth, Asked)> {
+    let measured = measure(frame, config, picture, rng)?;
+    let (mut told, held_back) = match config.labels {
         LabelSource::Dense => (measured, None),
         LabelSource::Sparse => split(&measured, rng)?,
     };
-    let asked = questions(&frame, held_back.as_ref(), config.questions, rng);
-    written(asking, &frame.rgb, &prompted, config.prompt_points, &asked, rng.random())
+    if rng.random::<f32>() < config.errors {
+        told = spoil(&told, rng)?;
+    }
+    let asked = questions(frame, held_back.as_ref(), (config.questions, config.edges), Some(&told), rng);
+    Ok((told, asked))
 }
 
 /// Writes questions about a frame, whose sides are multiples of patch x merge. `asked` holds pixels with their true depth in
@@ -249,6 +307,7 @@ fn augment(frame: &mut RgbdFrame, rng: &mut ChaCha8Rng) {
         for row in frame.depth.chunks_mut(width) {
             row.reverse();
         }
+        frame.intrinsics.cx = (width - 1) as f32 - frame.intrinsics.cx;
     }
     debug_assert_eq!(frame.depth.len(), width * height);
     let mut order = [0, 1, 2];
@@ -273,25 +332,6 @@ fn recolour(rgb: &mut RgbImage, order: [usize; 3], grey: bool) {
     }
 }
 
-/// Measurements of a frame: a pattern and a number of points drawn at random. A share of the frames is seen by a random
-/// camera and measured by a random depth sensor; the frame's depth, of which labels are made, stays clean.
-fn measure(frame: &mut RgbdFrame, config: &BatchConfig, rng: &mut ChaCha8Rng) -> Result<SparseDepth> {
-    let (width, height) = (frame.rgb.width() as usize, frame.rgb.height() as usize);
-    let (low, high) = config.points;
-    let points = (low as f32 * (high as f32 / low as f32).powf(rng.random::<f32>())) as usize;
-    let pattern = match rng.random_range(0..10) {
-        0 => SparsePattern::Sfm,
-        1 | 2 => SparsePattern::Lidar { lines: rng.random_range(4..24) },
-        _ => SparsePattern::Uniform,
-    };
-    if rng.random::<f32>() >= config.sensors {
-        return pattern.sample(&frame.rgb, &frame.depth, width, height, points, rng);
-    }
-    let measured = DepthSensor::draw(rng).measure(&frame.rgb, &frame.depth, rng)?;
-    frame.rgb = CameraModel::draw(rng).photograph(&frame.rgb, rng)?;
-    pattern.sample(&frame.rgb, &measured, width, height, points, rng)
-}
-
 /// Holds 30 % of the measurements back as labels.
 fn split(measured: &SparseDepth, rng: &mut ChaCha8Rng) -> Result<(SparseDepth, Option<SparseDepth>)> {
     let (held, shown): (Vec<_>, Vec<_>) = measured.points().partition(|_| rng.random_bool(0.3));
@@ -299,23 +339,36 @@ fn split(measured: &SparseDepth, rng: &mut ChaCha8Rng) -> Result<(SparseDepth, O
     Ok((SparseDepth::from_points(w, h, &shown)?, Some(SparseDepth::from_points(w, h, &held)?)))
 }
 
-/// Pixels to ask and their true depths.
-pub(super) fn questions(
-    frame: &RgbdFrame,
-    held_back: Option<&SparseDepth>,
-    count: usize,
-    rng: &mut ChaCha8Rng,
-) -> Vec<(usize, usize, f32)> {
-    let width = frame.rgb.width() as usize;
-    let known: Vec<(usize, usize, f32)> = match held_back {
-        Some(sparse) => sparse.points().collect(),
-        None => (0..frame.depth.len())
-            .filter(|&i| frame.depth[i].is_finite())
-            .map(|i| (i % width, i / width, frame.depth[i]))
-            .collect(),
-    };
-    if known.is_empty() {
-        return Vec::new();
+#[cfg(test)]
+mod tests {
+    use super::super::asked::tests::post;
+    use super::*;
+    use crate::scenes::procedural;
+
+    #[test]
+    fn labels_stay_clean_whatever_is_told() {
+        let frame = post();
+        let config = BatchConfig { errors: 1.0, sensors: 0.0, ..Default::default() };
+        for seed in 0..30 {
+            let mut rng = ChaCha8Rng::seed_from_u64(seed);
+            let mut seen = frame.clone();
+            let (told, asked) = told_and_asked(&mut seen, &config, None, &mut rng).unwrap();
+            assert!(told.points().any(|(_, _, d)| d != 1.0 && d != 3.0), "{seed}: nothing is wrong");
+            assert!(asked.iter().all(|p| p.2 == 1.0 || p.2 == 3.0));
+            let clean = BatchConfig { errors: 0.0, ..config.clone() };
+            let (told, _) = told_and_asked(&mut seen, &clean, None, &mut rng).unwrap();
+            assert!(told.points().all(|(_, _, d)| d == 1.0 || d == 3.0));
+        }
     }
-    (0..count).map(|_| known[rng.random_range(0..known.len())]).collect()
+
+    #[test]
+    fn a_mirrored_frame_is_seen_by_a_mirrored_camera() {
+        for seed in 0..20 {
+            let (clean, mut seen) = (procedural(5, 64, 48).unwrap(), procedural(5, 64, 48).unwrap());
+            augment(&mut seen, &mut ChaCha8Rng::seed_from_u64(seed));
+            let mirrored = seen.depth[0].to_bits() == clean.depth[63].to_bits();
+            let cx = if mirrored { 63.0 - clean.intrinsics.cx } else { clean.intrinsics.cx };
+            assert_eq!(seen.intrinsics.cx, cx);
+        }
+    }
 }

@@ -1,10 +1,13 @@
 //! Textual supervision (Sec. 3.4): training with the answer's tokens as labels. Feature `train`.
 
+mod asked;
 pub(crate) mod batch;
 mod config;
 mod evaluate;
 pub(crate) mod init;
 pub(crate) mod loss;
+mod measure;
+pub(crate) mod mix;
 mod optimiser;
 mod pass;
 pub(crate) mod records;
@@ -17,5 +20,6 @@ mod vocabulary;
 pub use batch::{BatchConfig, LabelSource};
 pub use config::TrainConfig;
 pub use evaluate::{HeldOut, evaluate};
+pub use mix::SceneMix;
 pub use optimiser::AdamW;
 pub use trainer::{StepReport, Trainer};

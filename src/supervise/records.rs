@@ -1,13 +1,16 @@
 //! Which records a set holds: frames, variants and questions by number, the same for the same seed wherever they are made.
 
+use super::asked::questions;
 use super::batch::{
-    Asking, BatchConfig, Example, example_of, frame, held_out_seed, mix, training_seed, written,
+    Asking, BatchConfig, Example, example_again, frame, held_out_seed, mix, training_seed, written,
 };
+use super::mix::Scenes;
 use super::shard::{About, Dims, Shard, VERSION};
 use crate::depth::SparsePattern;
 use crate::error::{Error, Result};
 use crate::query::{Hint, MeasurementPrompt, PixelReference};
 use crate::scenes::RgbdFrame;
+use image::RgbImage;
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
@@ -95,18 +98,28 @@ impl RecordConfig {
         Ok(())
     }
 
-    /// Makes a shard, on all cores.
+    /// Whether the set's scenes are never trained on.
+    pub fn held_out(&self) -> bool {
+        matches!(self.set, RecordSet::HeldOut { .. })
+    }
+
+    /// Makes a shard of scenes of the batch's mix, on all cores.
     ///
     /// # Errors
-    /// As [`RecordConfig::check`]; a frame of which nothing can be measured is replaced by the next seed's, eight times.
-    pub fn shard(&self, asking: Asking, index: u64) -> Result<Shard> {
+    /// As [`RecordConfig::check`] and [`Scenes::check`]; a frame of which nothing can be measured is replaced by the next seed's, eight times.
+    pub fn shard(&self, asking: Asking, scenes: &Scenes, index: u64) -> Result<Shard> {
         self.check(asking)?;
+        scenes.check(self.held_out())?;
+        if scenes.mix() != self.batch.mix {
+            let found = format!("{:?}", scenes.mix());
+            return Err(Error::argument("mix", found, format!("the records' own: {:?}", self.batch.mix)));
+        }
         let size =
             self.batch.sizes[(mix(self.seed ^ 0x51CE, index) % self.batch.sizes.len() as u64) as usize];
         let first = index.saturating_mul(self.batch.frames as u64);
         let made: Vec<(u64, Vec<Example>)> = (first..first.saturating_add(self.batch.frames as u64))
             .into_par_iter()
-            .map(|number| self.frame(asking, number, size))
+            .map(|number| self.frame(asking, scenes, number, size))
             .collect::<Result<_>>()?;
         let about = About {
             version: VERSION,
@@ -132,7 +145,13 @@ impl RecordConfig {
     }
 
     /// One frame by its number in the set: the scene's seed, and its variants.
-    fn frame(&self, asking: Asking, number: u64, size: (usize, usize)) -> Result<(u64, Vec<Example>)> {
+    fn frame(
+        &self,
+        asking: Asking,
+        scenes: &Scenes,
+        number: u64,
+        size: (usize, usize),
+    ) -> Result<(u64, Vec<Example>)> {
         let base = mix(self.seed, number);
         let mut tries = 0;
         loop {
@@ -141,9 +160,15 @@ impl RecordConfig {
                 RecordSet::Train => training_seed(random),
                 RecordSet::HeldOut { .. } => held_out_seed(random),
             };
-            let made = frame(seed, size).and_then(|f| {
-                let variant = |v| self.variant(asking, &f, &mut ChaCha8Rng::seed_from_u64(mix(random, v)));
-                (1..=self.variants as u64).map(variant).collect::<Result<Vec<_>>>()
+            let made = frame(scenes, seed, size).and_then(|f| {
+                let dice = |v| ChaCha8Rng::seed_from_u64(mix(random, v));
+                let mut made = vec![self.variant(asking, &f, None, &mut dice(1))?];
+                // A shard holds one picture of a frame: the first variant's.
+                let picture = made[0].pixels.resized.clone();
+                for v in 2..=self.variants as u64 {
+                    made.push(self.variant(asking, &f, Some(&picture), &mut dice(v))?);
+                }
+                Ok(made)
             });
             match made {
                 Err(_) if tries < 8 => tries += 1,
@@ -153,14 +178,20 @@ impl RecordConfig {
         }
     }
 
-    fn variant(&self, asking: Asking, frame: &RgbdFrame, rng: &mut ChaCha8Rng) -> Result<Example> {
+    fn variant(
+        &self,
+        asking: Asking,
+        frame: &RgbdFrame,
+        picture: Option<&RgbImage>,
+        rng: &mut ChaCha8Rng,
+    ) -> Result<Example> {
         let RecordSet::HeldOut { points, grid } = self.set else {
-            return example_of(asking, &self.batch, frame, rng);
+            return example_again(asking, &self.batch, frame, picture, rng);
         };
         let (width, height) = (frame.width(), frame.height());
         let sparse = SparsePattern::Uniform.sample(&frame.rgb, &frame.depth, width, height, points, rng)?;
         let asked = match grid {
-            None => super::batch::questions(frame, None, self.batch.questions, rng),
+            None => questions(frame, None, (self.batch.questions, 0.0), None, rng),
             Some(step) => (step / 2..height)
                 .step_by(step)
                 .flat_map(|y| (step / 2..width).step_by(step).map(move |x| (x, y)))

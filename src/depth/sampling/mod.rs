@@ -3,6 +3,7 @@
 pub(crate) mod choice;
 pub(crate) mod noise;
 mod scan;
+mod shapes;
 
 use std::str::FromStr;
 
@@ -28,32 +29,56 @@ pub enum SparsePattern {
     },
     /// Clustered at corners and edges of the picture, as triangulated features are.
     Sfm,
+    /// One row across the picture, as of a scanner with a single beam; at most one measurement per column.
+    Line,
+    /// The middles of `side` by `side` zones over the middle of the picture or all of it, as of a small time-of-flight sensor;
+    /// at most so many.
+    Block {
+        /// Zones per row and per column, at least 1.
+        side: usize,
+    },
+    /// Square cells over the whole picture; about as many as asked for, not more.
+    Grid,
+    /// Uniform but for a large rectangle or ellipse without any measurement.
+    Hole,
 }
 
 impl FromStr for SparsePattern {
     type Err = Error;
 
-    /// `uniform`, `lidar:LINES` or `sfm`.
+    /// `uniform`, `sfm`, `line`, `grid`, `hole`, `lidar:LINES` or `block:SIDE`.
     fn from_str(text: &str) -> Result<Self> {
-        let wrong = || Error::argument("sparse pattern", text, "uniform, lidar:LINES (1 to 4096) or sfm");
-        match text {
-            "uniform" => Ok(Self::Uniform),
-            "sfm" => Ok(Self::Sfm),
-            _ => {
-                let lines = text.strip_prefix("lidar:").and_then(|n| n.parse().ok()).ok_or_else(wrong)?;
-                if (1..=4096).contains(&lines) { Ok(Self::Lidar { lines }) } else { Err(wrong()) }
+        let expected = "uniform, sfm, line, grid, hole, lidar:LINES or block:SIDE (1 to 4096)";
+        let wrong = || Error::argument("sparse pattern", text, expected);
+        Ok(match text.split_once(':') {
+            None => match text {
+                "uniform" => Self::Uniform,
+                "sfm" => Self::Sfm,
+                "line" => Self::Line,
+                "grid" => Self::Grid,
+                "hole" => Self::Hole,
+                _ => return Err(wrong()),
+            },
+            Some((name, count)) => {
+                let count = count.parse().ok().filter(|n| (1..=4096).contains(n)).ok_or_else(wrong)?;
+                match name {
+                    "lidar" => Self::Lidar { lines: count },
+                    "block" => Self::Block { side: count },
+                    _ => return Err(wrong()),
+                }
             }
-        }
+        })
     }
 }
 
 impl SparsePattern {
-    /// Chooses `points` distinct valid pixels (all of them when there are fewer) and keeps their depth bit for bit.
+    /// Chooses `points` distinct valid pixels (all of them when there are fewer, or as many as the pattern holds) and keeps
+    /// their depth bit for bit.
     ///
     /// `depth` is row-major `width * height` metres; values that are not finite and positive are never chosen.
     ///
     /// Fails with [`Error::BufferLength`] or [`Error::SizeMismatch`] when sizes disagree, [`Error::Argument`] for zero
-    /// points or zero lines, and [`Error::NoMeasurement`] when no pixel is valid.
+    /// points, lines or zones, and [`Error::NoMeasurement`] when no pixel is valid or the pattern meets none.
     pub fn sample(
         &self,
         rgb: &RgbImage,
@@ -83,8 +108,37 @@ impl SparsePattern {
                 // Smallest exponential waiting times: a weighted choice without replacement.
                 take_least(&mut valid, points, |i| -rng.random::<f32>().max(1e-30).ln() / weight[i]);
             }
+            Self::Line | Self::Block { .. } | Self::Grid | Self::Hole => {
+                valid = self.place(valid, depth, (width, height), points, rng)?;
+            }
         }
-        keep(depth, width, height, &valid[..points])
+        keep(depth, width, height, &valid[..points.min(valid.len())])
+    }
+
+    /// The pixels of patterns that cover a part of the picture, in random order if there are more than `points`.
+    fn place(
+        &self,
+        valid: Vec<usize>,
+        depth: &[f32],
+        (width, height): (usize, usize),
+        points: usize,
+        rng: &mut impl Rng,
+    ) -> Result<Vec<usize>> {
+        let mut chosen = match *self {
+            Self::Block { side: 0 } => return Err(Error::argument("side", 0, "at least 1")),
+            Self::Block { side } => shapes::block(width, height, side, rng),
+            Self::Line => shapes::line(width, height, points, rng),
+            Self::Grid => shapes::grid(width, height, points, rng),
+            _ => shapes::outside_of_a_hole(&valid, width, height, rng),
+        };
+        chosen.retain(|&i| depth.get(i).is_some_and(|d| d.is_finite() && *d > 0.0));
+        if chosen.is_empty() {
+            return Err(Error::NoMeasurement { width, height });
+        }
+        if chosen.len() > points {
+            shuffle_first(&mut chosen, points, rng);
+        }
+        Ok(chosen)
     }
 }
 
@@ -210,11 +264,73 @@ mod tests {
     }
 
     #[test]
+    fn parts_of_the_picture_are_measured_as_their_devices_do() {
+        let (w, h) = (200, 150);
+        let (rgb, depth) = (RgbImage::new(200, 150), vec![2.0; 30_000]);
+        let mut rng = ChaCha8Rng::seed_from_u64(5);
+        let mut drawn = |pattern: SparsePattern, points: usize| -> Vec<(usize, usize)> {
+            let sparse = pattern.sample(&rgb, &depth, w, h, points, &mut rng).unwrap();
+            assert!(sparse.measured() <= points);
+            sparse.points().map(|(x, y, _)| (x, y)).collect()
+        };
+        let distinct = |of: &mut dyn Iterator<Item = usize>| {
+            let mut all: Vec<usize> = of.collect();
+            all.sort_unstable();
+            all.dedup();
+            all.len()
+        };
+        for _ in 0..20 {
+            let line = drawn(SparsePattern::Line, 5000);
+            assert!(line.len() == 200 && distinct(&mut line.iter().map(|p| p.0)) == 200);
+            assert!(distinct(&mut line.iter().map(|p| p.1)) <= 10);
+            let block = drawn(SparsePattern::Block { side: 16 }, 5000);
+            assert_eq!(block.len(), 256);
+            assert_eq!(distinct(&mut block.iter().map(|p| p.0)), 16);
+            let grid = drawn(SparsePattern::Grid, 400);
+            assert!((300..=400).contains(&grid.len()), "{}", grid.len());
+            assert_eq!(
+                distinct(&mut grid.iter().map(|p| p.0)) * distinct(&mut grid.iter().map(|p| p.1)),
+                grid.len()
+            );
+            let around = drawn(SparsePattern::Hole, 3000);
+            let cell = |x: usize, y: usize| around.iter().filter(|p| p.0 / 20 == x && p.1 / 15 == y).count();
+            let empty = (0..100).filter(|i| cell(i % 10, i / 10) == 0).count();
+            assert!(around.len() == 3000 && empty >= 1, "{empty} of 100 cells are empty");
+            assert!(
+                drawn(SparsePattern::Grid, 1).len() == 1
+                    && drawn(SparsePattern::Block { side: 9 }, 5).len() == 5
+            );
+        }
+        // A row of the sky.
+        let mut sky = vec![f32::NAN; 30_000];
+        sky[29_999] = 1.0;
+        let none = SparsePattern::Line.sample(&rgb, &sky, w, h, 10, &mut rng);
+        assert!(matches!(none, Err(Error::NoMeasurement { .. })));
+        let zero = SparsePattern::Block { side: 0 }.sample(&rgb, &depth, w, h, 10, &mut rng);
+        assert!(matches!(zero, Err(Error::Argument { name: "side", .. })));
+    }
+
+    #[test]
     fn names_are_read() {
+        assert_eq!("block:64".parse::<SparsePattern>().unwrap(), SparsePattern::Block { side: 64 });
+        assert_eq!("line".parse::<SparsePattern>().unwrap(), SparsePattern::Line);
+        assert_eq!("hole".parse::<SparsePattern>().unwrap(), SparsePattern::Hole);
+        assert_eq!("grid".parse::<SparsePattern>().unwrap(), SparsePattern::Grid);
         assert_eq!("uniform".parse::<SparsePattern>().unwrap(), SparsePattern::Uniform);
         assert_eq!("lidar:16".parse::<SparsePattern>().unwrap(), SparsePattern::Lidar { lines: 16 });
         assert_eq!("sfm".parse::<SparsePattern>().unwrap(), SparsePattern::Sfm);
-        for wrong in ["", "lidar", "lidar:0", "lidar:x", "lidar:-3", "grid", "lidar:99999999999999999999"] {
+        for wrong in [
+            "",
+            "lidar",
+            "lidar:0",
+            "lidar:x",
+            "lidar:-3",
+            "block",
+            "block:0",
+            "line:3",
+            "grids",
+            "lidar:99999999999999999999",
+        ] {
             assert!(wrong.parse::<SparsePattern>().is_err(), "{wrong}");
         }
     }

@@ -1,5 +1,5 @@
-//! From a scene to linear colours and depth: one ray per pixel, one to a light, one for what other surfaces throw back, and
-//! three more at edges.
+//! From a scene to linear colours and depth: one ray per pixel and two more at edges; one to a light and one for what other
+//! surfaces throw back per square of two by two pixels, which the surface around shares.
 
 use super::light::{Lights, luma};
 use super::look::{Look, linear_table};
@@ -12,11 +12,11 @@ use crate::depth::sampling::noise::hash;
 use crate::scenes::camera::Camera;
 use crate::scenes::space::{V3, add, dot, mix, mul, norm, sub, times, to_world, unit};
 
-/// Where each pixel of a square of sixteen takes its numbers from, so that together they cover the range.
+/// Where each of a square of sixteen takes its numbers from, so that together they cover the range.
 const ORDER: [u32; 16] = [0, 8, 2, 10, 12, 4, 14, 6, 3, 11, 1, 9, 15, 7, 13, 5];
 
 /// Rays that look past a pixel's middle, at edges.
-const AROUND: [[f32; 2]; 3] = [[-0.33, -0.18], [0.3, -0.32], [0.05, 0.36]];
+const AROUND: [[f32; 2]; 2] = [[-0.31, -0.22], [0.27, 0.33]];
 
 /// The part of the mean light that comes from everywhere.
 pub(super) const AMBIENT: f32 = 0.22;
@@ -62,14 +62,7 @@ pub(super) fn render(view: &View) -> Rendered {
     let frame = Frame { view, linear: linear_table(), pixel: 1.0 / view.camera.k.fx };
     let (w, h) = (view.width, view.height);
     let points: Vec<Option<Point>> = (0..w * h).map(|i| frame.look((i % w) as f32, (i / w) as f32)).collect();
-    let raw: Vec<Share> = points
-        .iter()
-        .enumerate()
-        .map(|(i, p)| {
-            p.as_ref().map_or(Share::default(), |p| frame.gather(p, (i % w) as u32, (i / w) as u32))
-        })
-        .collect();
-    let smooth = smoothed(&points, raw, w);
+    let smooth = mean(&points, &frame.lit(&points), w);
     let middle: Vec<V3> = points
         .iter()
         .zip(&smooth)
@@ -126,7 +119,40 @@ impl Frame<'_> {
         Some(Point { hit, at, normal, flat, albedo })
     }
 
-    /// One ray to a light and one to another surface.
+    /// Light at every pixel: gathered at one pixel of each square of two by two, and of those of sixteen squares around a
+    /// pixel the mean of those on its surface. What is too thin for that asks on its own.
+    fn lit(&self, points: &[Option<Point>]) -> Vec<Share> {
+        let (w, h) = (self.view.width, self.view.height);
+        let (columns, rows) = (w.div_ceil(2), h.div_ceil(2));
+        let square = |k: usize| {
+            let (bx, by) = (k % columns, k / columns);
+            let start = hash(bx as i32, by as i32, self.view.seed) as usize;
+            (start..start.wrapping_add(4)).find_map(|n| {
+                let (x, y) = ((2 * bx + (n & 1)).min(w - 1), (2 * by + (n >> 1 & 1)).min(h - 1));
+                let p = points[y * w + x].as_ref()?;
+                Some((p, self.gather(p, bx as u32, by as u32)))
+            })
+        };
+        let gathered: Vec<Option<(&Point, Share)>> = (0..columns * rows).map(square).collect();
+        let at = |i: usize| {
+            let Some(p) = &points[i] else { return Share::default() };
+            let (x, y) = (i % w, i / w);
+            let mut sum = Sum::default();
+            for by in ((y + 1) / 2).saturating_sub(2)..((y + 1) / 2 + 2).min(rows) {
+                for bx in ((x + 1) / 2).saturating_sub(2)..((x + 1) / 2 + 2).min(columns) {
+                    if let Some((q, share)) = &gathered[by * columns + bx]
+                        && p.continues(q)
+                    {
+                        sum.add(share, 1.0);
+                    }
+                }
+            }
+            sum.mean().unwrap_or_else(|| self.gather(p, x as u32, y as u32))
+        };
+        (0..points.len()).map(at).collect()
+    }
+
+    /// One ray to a light and one to another surface; their numbers depend on the place in a square of sixteen.
     fn gather(&self, p: &Point, x: u32, y: u32) -> Share {
         let k = ORDER[(4 * (y & 3) + (x & 3)) as usize];
         let jitter = |n: u32| hash(x as i32, (y * 8 + n) as i32, self.view.seed) as f32 / 4_294_967_296.0;
@@ -236,7 +262,7 @@ impl Frame<'_> {
         }
     }
 
-    /// Averages of four rays where a pixel's neighbours show something else.
+    /// Averages of three rays where a pixel's neighbours show something else.
     fn softened(&self, middle: Vec<V3>, points: &[Option<Point>], shares: &[Share]) -> Vec<V3> {
         let (w, h) = (self.view.width, self.view.height);
         let mut out = middle.clone();
@@ -259,7 +285,7 @@ impl Frame<'_> {
                     });
                     sum = add(sum, self.colour(point.as_ref(), &share, self.view.camera.ray(px, py)));
                 }
-                out[i] = mul(sum, 0.25);
+                out[i] = mul(sum, 1.0 / (1.0 + AROUND.len() as f32));
             }
         }
         out
@@ -317,42 +343,56 @@ fn differ(a: Option<&Point>, b: Option<&Point>) -> bool {
     }
 }
 
-/// Means over pixels of the same surface: first over squares of four by four, in which the rays' numbers are spread evenly, then
-/// with weights over wider ones.
-fn smoothed(points: &[Option<Point>], raw: Vec<Share>, w: usize) -> Vec<Share> {
-    const SQUARE: [(isize, f32); 4] = [(-1, 1.0), (0, 1.0), (1, 1.0), (2, 1.0)];
-    let tent = |step: isize| [(-step, 0.5), (0, 1.0), (step, 0.5)];
-    let mut shares = mean(points, &raw, w, &SQUARE);
-    for step in [2, 4] {
-        shares = mean(points, &shares, w, &tent(step));
+impl Point {
+    /// Whether another point is on the same surface near by.
+    fn continues(&self, q: &Point) -> bool {
+        let flat = 0.003 + 0.006 * self.hit.touch.t;
+        dot(q.normal, self.normal) > 0.9 && dot(sub(q.at, self.at), self.normal).abs() < flat
     }
-    shares
 }
 
-/// Weighted means; `taps` are offsets and weights along x and along y.
-fn mean(points: &[Option<Point>], raw: &[Share], w: usize, taps: &[(isize, f32)]) -> Vec<Share> {
+/// A weighted mean in the making.
+#[derive(Default)]
+struct Sum {
+    share: Share,
+    weight: f32,
+}
+
+impl Sum {
+    fn add(&mut self, share: &Share, weight: f32) {
+        self.share.lamps += weight * share.lamps;
+        self.share.bounce = add(self.share.bounce, mul(share.bounce, weight));
+        self.weight += weight;
+    }
+
+    fn mean(&self) -> Option<Share> {
+        let scale = 1.0 / self.weight;
+        let share = Share { lamps: self.share.lamps * scale, bounce: mul(self.share.bounce, scale) };
+        (self.weight > 0.0).then_some(share)
+    }
+}
+
+/// Distance between the pixels of [`mean`].
+const STEP: usize = 4;
+
+/// Means over nine pixels of the same surface, the outer ones with half the weight per direction.
+fn mean(points: &[Option<Point>], shares: &[Share], w: usize) -> Vec<Share> {
     let h = points.len() / w;
     let at = |i: usize| {
         let Some(p) = &points[i] else { return Share::default() };
-        let (x, y) = (i % w, i / w);
-        let flat = 0.003 + 0.006 * p.hit.touch.t;
-        let (mut sum, mut total) = (Share::default(), 0.0f32);
-        for &(dy, wy) in taps {
-            let Some(row) = y.checked_add_signed(dy).filter(|&j| j < h) else { continue };
-            for &(dx, wx) in taps {
-                let Some(column) = x.checked_add_signed(dx).filter(|&k| k < w) else { continue };
-                let k = row * w + column;
-                let Some(q) = &points[k] else { continue };
-                if dot(q.normal, p.normal) > 0.9 && dot(sub(q.at, p.at), p.normal).abs() < flat {
-                    let weight = wx * wy;
-                    sum.lamps += weight * raw[k].lamps;
-                    sum.bounce = add(sum.bounce, mul(raw[k].bounce, weight));
-                    total += weight;
+        let (x, y, mut sum) = (i % w, i / w, Sum::default());
+        for (row, wy) in [(y.checked_sub(STEP), 0.5), (Some(y), 1.0), (Some(y + STEP), 0.5)] {
+            let Some(row) = row.filter(|&j| j < h) else { continue };
+            for (column, wx) in [(x.checked_sub(STEP), 0.5), (Some(x), 1.0), (Some(x + STEP), 0.5)] {
+                let Some(k) = column.filter(|&k| k < w).map(|k| row * w + k) else { continue };
+                if let Some(q) = &points[k]
+                    && p.continues(q)
+                {
+                    sum.add(&shares[k], wx * wy);
                 }
             }
         }
-        let scale = 1.0 / total.max(1e-6);
-        Share { lamps: sum.lamps * scale, bounce: mul(sum.bounce, scale) }
+        sum.mean().unwrap_or(shares[i])
     };
     (0..points.len()).map(at).collect()
 }
