@@ -1,7 +1,7 @@
 //! Numbers as tokens: how a depth is written into a prompt, and how an answer is read from logits.
 
 use crate::error::{Error, Result};
-use crate::kernels::bin_stats;
+use crate::kernels::{BinStats, bin_stats};
 use crate::vlm::chat::tokenizer::Tokenizer;
 
 /// What the number 1 means in prompts and answers.
@@ -159,9 +159,19 @@ pub fn read_bins(logits: &[f32], range: f64) -> Reading {
 
 /// As [`read_bins`], with a buffer to use again.
 pub fn read_bins_with(logits: &[f32], range: f64, scratch: &mut Vec<f32>) -> Reading {
-    let width = (range / logits.len() as f64) as f32;
+    of_bin_stats(bin_stats(logits, scratch, confident_bins), logits.len(), range)
+}
+
+/// Half-width of the interval whose probability is the confidence, in bins, around a median.
+pub(crate) fn confident_bins(median: f32) -> f32 {
     // At least one bin's width, or a sharp answer of a near pixel could never be confident.
-    match bin_stats(logits, scratch, |median| (median * CONFIDENT_WITHIN).max(1.0)) {
+    (median * CONFIDENT_WITHIN).max(1.0)
+}
+
+/// What the statistics of a distribution over `bins` bins from 0 to `range` say.
+pub(crate) fn of_bin_stats(stats: Option<BinStats>, bins: usize, range: f64) -> Reading {
+    let width = (range / bins as f64) as f32;
+    match stats {
         Some(s) => Reading { value: s.median * width, confidence: s.near, expected_error: s.spread * width },
         None => Reading::INVALID,
     }
