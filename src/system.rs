@@ -15,10 +15,29 @@ pub fn device(name: &str) -> Result<Device> {
     let index = |n: &str| n.parse().map_err(|_| Error::argument("device", name, "cpu, cuda:N or metal"));
     match name.split_once(':') {
         None if name == "cpu" => Ok(Device::Cpu),
-        None if name == "cuda" => Ok(Device::new_cuda_with_stream(0)?),
+        None if name == "cuda" => cuda(0),
         None if name == "metal" => Ok(Device::new_metal(0)?),
-        Some(("cuda", n)) => Ok(Device::new_cuda_with_stream(index(n)?)?),
+        Some(("cuda", n)) => cuda(index(n)?),
         _ => Err(Error::argument("device", name, "cpu, cuda:N or metal")),
+    }
+}
+
+fn cuda(index: usize) -> Result<Device> {
+    let device = Device::new_cuda_with_stream(index)?;
+    #[cfg(feature = "cuda")]
+    if let Device::Cuda(cuda) = &device {
+        crate::kernels::prepare(cuda)?;
+    }
+    Ok(device)
+}
+
+/// Bytes of a CUDA device's memory that are in use, by all processes; `None` for other devices. What was freed may stay with the process
+/// that had it, so that after some work this is about the most that it took.
+pub fn device_memory_bytes(device: &Device) -> Option<u64> {
+    match device {
+        #[cfg(feature = "cuda")]
+        Device::Cuda(cuda) => crate::kernels::held_bytes(cuda),
+        _ => None,
     }
 }
 

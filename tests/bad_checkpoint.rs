@@ -5,7 +5,6 @@ mod common;
 use candle_core::{DType, Device, Tensor};
 use common::tiny::{self, Tensors};
 use sdim::Error;
-use sdim::LoadOptions;
 use sdim::internals::model::{AskOptions, SdimModel, ask};
 use sdim::internals::query::Query;
 use sdim::internals::supervise::FreshFiles;
@@ -39,7 +38,7 @@ impl Checkpoint {
     }
 
     fn load(&self) -> Result<SdimModel, Error> {
-        SdimModel::load(self.dir.path(), &LoadOptions::default())
+        SdimModel::load(self.dir.path(), &common::load_options())
     }
 
     fn error(&self) -> Error {

@@ -1,5 +1,7 @@
 //! The promises of `DepthCompleter::complete`, on the embedded checkpoint.
 
+mod common;
+
 use image::RgbImage;
 use sdim::depth::sample_points;
 use sdim::scenes::procedural;
@@ -9,7 +11,8 @@ use sdim::{
 };
 use std::sync::{Arc, LazyLock, Mutex};
 
-static TINY: LazyLock<DepthCompleter> = LazyLock::new(|| DepthCompleter::tiny().unwrap());
+static TINY: LazyLock<DepthCompleter> =
+    LazyLock::new(|| DepthCompleter::tiny_with(&common::load_options()).unwrap());
 
 fn options(plan: QueryPlan) -> CompleteOptions {
     CompleteOptions::default().with_plan(plan)
@@ -173,9 +176,11 @@ fn progress_counts_up_and_a_token_stops() {
     let seen = Arc::new(Mutex::new(Vec::new()));
     let cancel = sdim::CancelToken::default();
     let (log, token) = (seen.clone(), cancel.clone());
-    let watched = options(QueryPlan::Every)
+    let mut watched = options(QueryPlan::Every)
         .with_progress(move |p| log.lock().unwrap().push((p.answered, p.planned)))
         .with_cancel(token);
+    // Several batches on any device.
+    watched.max_memory = Some(100_000_000);
     TINY.complete(&rgb, &sparse, &watched).unwrap();
     let calls = std::mem::take(&mut *seen.lock().unwrap());
     assert!(calls.len() > 1 && calls.windows(2).all(|w| w[0].0 < w[1].0));
@@ -202,7 +207,13 @@ fn a_memory_limit_makes_smaller_batches_and_the_same_map() {
     // A row of the tiny model takes 15 kB: 8 x 192 + 3 x 512 values in passing, 2 x 4 x 96 kept.
     let (tight, thirteen) = run(Some(200_000));
     let (least, one) = run(Some(1));
-    assert!(all > 200 && thirteen == 13 && one == 1, "{all}, {thirteen}, {one}");
+    assert!(all > 200 && one == 1, "{all}, {one}");
+    if common::device().is_cpu() {
+        assert_eq!(thirteen, 13);
+    } else {
+        // There the scores against the prefix take memory, too.
+        assert!((1..13).contains(&thirteen), "{thirteen}");
+    }
     for map in [&tight, &least] {
         for (a, b) in map.depth().iter().zip(free.depth()) {
             assert!((a - b).abs() <= 1e-3 * b, "{a} is not {b}");

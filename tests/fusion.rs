@@ -2,9 +2,9 @@
 
 mod common;
 
-use candle_core::{Device, Tensor};
-use common::relative_difference;
+use candle_core::Tensor;
 use common::tiny::{self, Tensors};
+use common::{device, relative_difference};
 use sdim::SparseDepth;
 use sdim::internals::fusion::{BatchStats, Fusion, Normalise};
 use sdim::internals::model::{AskOptions, SdimModel, ask};
@@ -30,7 +30,7 @@ fn noise(count: usize, seed: u32) -> Vec<f32> {
 
 fn random(shape: &[usize], scale: f32, offset: f32, seed: u32) -> Tensor {
     let values: Vec<f32> = noise(shape.iter().product(), seed).iter().map(|v| v * scale + offset).collect();
-    Tensor::from_vec(values, shape, &Device::Cpu).unwrap()
+    Tensor::from_vec(values, shape, &device()).unwrap()
 }
 
 /// He's scale (uniform with the same variance) for the two convolutions that start at zero.
@@ -151,7 +151,7 @@ fn running_statistics_that_equal_the_batchs_give_the_batchs_output() {
         for (part, values) in [("running_mean", s.mean), ("running_var", s.var)] {
             let count = values.len();
             let old = tensors
-                .insert(format!("{}.{part}", s.name), Tensor::from_vec(values, count, &Device::Cpu).unwrap());
+                .insert(format!("{}.{part}", s.name), Tensor::from_vec(values, count, &device()).unwrap());
             assert!(old.is_some(), "{} is no name of a checkpoint", s.name);
         }
     }

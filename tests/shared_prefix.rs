@@ -2,7 +2,7 @@
 
 mod common;
 
-use candle_core::{Device, Tensor};
+use candle_core::Tensor;
 use common::{close, relative_difference, tiny};
 use image::RgbImage;
 use sdim::SparseDepth;
@@ -101,7 +101,7 @@ impl Setup {
     fn together(&self, suffixes: &[Tokens]) -> Tensor {
         let decoder = &self.model.vlm.decoder;
         let positions: Vec<Position> = suffixes.iter().flat_map(|s| s.positions.clone()).collect();
-        let table = decoder.rope().table(&positions, &Device::Cpu).unwrap();
+        let table = decoder.rope().table(&positions, &common::device()).unwrap();
         let mut own = decoder.cache(suffixes.len());
         let context = Context::Cached { shared: Some(&self.prefix.cache), own: &mut own };
         decoder.forward(&self.embed(suffixes), &table, context, None).unwrap()
@@ -113,7 +113,7 @@ impl Setup {
         let embedded = Tensor::cat(&[&self.embedded, &self.embed(suffixes)], 0).unwrap();
         let own = suffixes.iter().flat_map(|s| &s.positions);
         let positions: Vec<Position> = self.positions.iter().chain(own).copied().collect();
-        let table = decoder.rope().table(&positions, &Device::Cpu).unwrap();
+        let table = decoder.rope().table(&positions, &common::device()).unwrap();
         let (p, s, rows) = (self.positions.len(), suffixes[0].len(), positions.len());
         let block = |queries: std::ops::Range<usize>, shared, period| Block {
             own_start: queries.start,
@@ -378,7 +378,7 @@ fn the_prefix_matters() {
     let setup = Setup::new(&pointer_and_bins(), true, None);
     let suffix = setup.suffix(&setup.queries(1)[0]);
     let decoder = &setup.model.vlm.decoder;
-    let table = decoder.rope().table(&suffix.positions, &Device::Cpu).unwrap();
+    let table = decoder.rope().table(&suffix.positions, &common::device()).unwrap();
     let mut own = decoder.cache(1);
     let context = Context::Cached { shared: None, own: &mut own };
     let without =

@@ -1,5 +1,6 @@
 //! Sizes of the published models, and random weights for them.
 
+use rayon::prelude::*;
 use serde_json::{Value, json};
 
 /// `config.json` of a model by its short name.
@@ -39,13 +40,18 @@ pub fn random(name: &str, shape: &[usize]) -> Vec<f32> {
         [_] => vec![1.0; count],
         _ => {
             let scale = (3.0 / (count / shape[0]) as f32).sqrt() / (1 << 23) as f32;
-            // A linear congruence is random enough for timing, and instant.
-            let mut state = name.bytes().fold(0x2545_F491u32, |s, b| s.wrapping_mul(31) ^ u32::from(b));
-            let mut next = || {
-                state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
-                ((state >> 8) as f32 - (1 << 23) as f32) * scale
-            };
-            (0..count).map(|_| next()).collect()
+            let seed = name.bytes().fold(0x2545_F491u32, |s, b| s.wrapping_mul(31) ^ u32::from(b));
+            let mut out = vec![0f32; count];
+            out.par_chunks_mut((count / shape[0]).max(1)).enumerate().for_each(|(index, row)| {
+                // A linear congruence is random enough for timing, and instant.
+                let mut state = (seed ^ (index as u32).wrapping_mul(0x9E37_79B1)).wrapping_mul(0x85EB_CA6B);
+                state ^= state >> 13;
+                for value in row {
+                    state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+                    *value = ((state >> 8) as f32 - (1 << 23) as f32) * scale;
+                }
+            });
+            out
         }
     }
 }

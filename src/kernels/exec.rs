@@ -9,6 +9,12 @@ pub(super) fn on_cpu(tensors: &[&Tensor]) -> bool {
     tensors.iter().all(|t| t.device().is_cpu() && t.dtype() == DType::F32)
 }
 
+/// True where an operation of candle's without a gradient may stand in: no gradient is wanted, one type, elements in each.
+pub(super) fn one_kernel(tensors: &[&Tensor]) -> bool {
+    let Some(first) = tensors.first() else { return false };
+    tensors.iter().all(|t| !t.track_op() && t.dtype() == first.dtype() && t.elem_count() > 0)
+}
+
 /// The elements of a contiguous f32 CPU storage.
 pub(super) fn slice<'a>(storage: &'a CpuStorage, layout: &Layout) -> candle_core::Result<&'a [f32]> {
     #[cfg(test)]

@@ -16,6 +16,8 @@
 //! This module knows nothing of images or depth, and is the only home of `unsafe` in the crate.
 
 mod attention;
+#[cfg(feature = "cuda")]
+mod cuda;
 mod exec;
 mod gemm;
 mod isa;
@@ -29,12 +31,14 @@ mod threads;
 mod written;
 
 pub use attention::{AttentionLayout, Block, Precision, SharedKeys, attention};
+#[cfg(feature = "cuda")]
+pub(crate) use cuda::{held_bytes, prepare};
 pub(crate) use exec::read;
 pub use gemm::packed::{PackedGate, PackedWeight, RowMajor, WeightFormat};
 pub use memory::keep_freed_memory;
 pub use ops::{
-    AdamWStep, BinStats, adamw_step, add, affine_act, batch_norm_act, bin_stats, conv3x3, gelu_erf, linear,
-    packed_mlp, rms_norm, rope, swiglu,
+    AdamWStep, BinStats, adamw_step, add, affine_act, batch_norm_act, bin_stats, bin_stats_of_rows, conv3x3,
+    gelu_erf, linear, packed_mlp, rms_norm, rope, swiglu,
 };
 pub use peak::peak_gflops;
 pub(crate) use threads::in_pool;

@@ -16,9 +16,13 @@ use crate::query::settings::PixelReference;
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 
-/// Rows of one decoder pass, at most: large enough for efficient products, small enough for the caches.
+/// Rows of one decoder pass on the CPU, at most: large enough for efficient products, small enough for the caches.
 const BATCH_ROWS: usize = 2048;
-/// Queries whose prompts are written at a time, so that memory does not grow with their number.
+/// Bytes that a decoder pass on another device may take where nothing else is said: there a pass costs the least per row if it is large.
+const DEVICE_BYTES: usize = 2 << 30;
+/// Rows of one decoder pass on another device, at most.
+const DEVICE_ROWS: usize = 1 << 16;
+/// Queries whose prompts are written at a time, so that memory does not grow with their number; more where one batch holds more.
 const QUERY_CHUNK: usize = 8 * BATCH_ROWS;
 
 /// How queries are asked.
@@ -47,7 +51,7 @@ pub fn ask(
     options: AskOptions,
 ) -> Result<Vec<Reading>> {
     let unit = prefix.space.unit;
-    let rows = rows_within(model, options.max_memory);
+    let rows = rows_within(model, prefix, options.max_memory);
     let mut on = |_: usize| true;
     let progress = options.progress.unwrap_or(&mut on);
     match options.mode.unwrap_or(&model.prompts.settings().answer_mode) {
@@ -69,13 +73,19 @@ pub fn ask(
 }
 
 /// Rows of a decoder pass whose activations and own keys and values fit into a limit.
-fn rows_within(model: &SdimModel, max_memory: Option<usize>) -> usize {
+fn rows_within(model: &SdimModel, prefix: &Prefix, max_memory: Option<usize>) -> usize {
     let t = &model.vlm.config.text;
     // A layer holds about eight rows of its width at once (sums, norms, heads), and three of the MLP's.
     let passing = 8 * t.hidden_size + 3 * t.intermediate_size;
     let kept = 2 * t.layers * t.kv_heads * t.head_dim();
-    let bytes = (passing + kept).max(1) * size_of::<f32>();
-    max_memory.map_or(BATCH_ROWS, |limit| (limit / bytes).clamp(1, BATCH_ROWS))
+    if model.device.is_cpu() {
+        let bytes = (passing + kept).max(1) * size_of::<f32>();
+        return max_memory.map_or(BATCH_ROWS, |limit| (limit / bytes).clamp(1, BATCH_ROWS));
+    }
+    // Scores of every head against the prefix, and their softmax, are there in full.
+    let scores = 2 * t.heads * prefix.cache.len();
+    let bytes = (passing + kept + scores).max(1) * size_of::<f32>();
+    (max_memory.unwrap_or(DEVICE_BYTES) / bytes).clamp(1, DEVICE_ROWS)
 }
 
 /// Lets the model answer each query freely, token by token, and returns what it said, in the order of the queries.
@@ -89,7 +99,7 @@ pub fn generate(
     generation: &Generation,
     progress: &mut dyn FnMut(usize) -> bool,
 ) -> Result<Vec<FreeAnswer>> {
-    answer_freely(model, prefix, queries, generation, BATCH_ROWS, progress)
+    answer_freely(model, prefix, queries, generation, rows_within(model, prefix, None), progress)
 }
 
 fn answer_freely(
@@ -137,7 +147,8 @@ fn in_batches<T: Clone + Send>(
     }
     let mut out = vec![blank; queries.len()];
     let mut done = 0;
-    for (start, chunk) in (0..).step_by(QUERY_CHUNK).zip(queries.chunks(QUERY_CHUNK)) {
+    let at_a_time = QUERY_CHUNK.max(plan.rows);
+    for (start, chunk) in (0..).step_by(at_a_time).zip(queries.chunks(at_a_time)) {
         let suffixes: Vec<Tokens> = chunk
             .par_iter()
             .map(|q| model.prompts.tokens(q, &prefix.space, &model.tokenizer, plan.forced))
@@ -173,7 +184,11 @@ fn in_batches<T: Clone + Send>(
 fn forced_numbers(batch: &mut Batch) -> Result<Vec<Reading>> {
     let numbers = batch.model.prompts.numbers();
     if let Some(bins) = numbers.format.bins() {
-        return batch.of_numbers(Vec::new, |scratch, row| bins.read(row, scratch));
+        if batch.model.device.is_cpu() {
+            return batch.of_numbers(Vec::new, |scratch, row| bins.read(row, scratch));
+        }
+        let stats = batch.of_bins(|median| bins.tolerance(median))?;
+        return Ok(stats.into_iter().map(|s| s.map_or(Reading::INVALID, |s| bins.reading(s))).collect());
     }
     let NumberFormat::Digits { decimals, integers } = numbers.format else { return Ok(Vec::new()) };
     let items = batch.sequences.count();

@@ -4,16 +4,18 @@ use super::marked::MarkedFrame;
 use super::prefix::Prefix;
 use super::sdim_model::SdimModel;
 use crate::error::Result;
-use crate::kernels;
+use crate::kernels::{self, BinStats};
 use crate::query::Query;
 use crate::query::prompt::{Glimpse, Tokens};
 use crate::vlm::qwen2_5::rope::Position;
 use crate::vlm::qwen2_5::sequences::Sequences;
-use candle_core::Device;
+use candle_core::{Device, Tensor};
 use rayon::prelude::*;
 
-/// Rows whose logits are made and read at a time: what stays in the caches.
+/// Rows whose logits are made and read at a time on the CPU: what stays in the caches.
 const LOGIT_ROWS: usize = 256;
+/// Logits that are made at a time on another device, about.
+const DEVICE_LOGITS: usize = 1 << 24;
 
 /// Suffixes of equal length that are read together and go on together, token by token.
 pub(super) struct Batch<'a> {
@@ -76,11 +78,9 @@ impl<'a> Batch<'a> {
         scratch: impl Fn() -> S + Sync,
         read: impl Fn(&mut S, &[f32]) -> T + Sync,
     ) -> Result<Vec<T>> {
-        let items = self.sequences.count();
-        let mut out = Vec::with_capacity(items);
-        for first in (0..items).step_by(LOGIT_ROWS) {
-            let some = self.sequences.last().narrow(0, first, LOGIT_ROWS.min(items - first))?;
-            let logits = self.model.number_rows.linear(&some, None)?;
+        let mut out = Vec::with_capacity(self.sequences.count());
+        for logits in self.number_logits() {
+            let logits = logits?;
             let width = logits.dim(1)?.max(1);
             kernels::read(&logits.to_device(&Device::Cpu)?, |logits| {
                 out.par_extend(
@@ -90,5 +90,26 @@ impl<'a> Batch<'a> {
             })?;
         }
         Ok(out)
+    }
+
+    /// Statistics of each item's distribution over the numbers as bins, found where the logits are: what comes off a device that is
+    /// not the CPU is a few values of each item. `tolerance` is that of [`kernels::bin_stats`].
+    pub(super) fn of_bins(&self, tolerance: impl Fn(f32) -> f32) -> Result<Vec<Option<BinStats>>> {
+        let mut out = Vec::with_capacity(self.sequences.count());
+        for logits in self.number_logits() {
+            out.extend(kernels::bin_stats_of_rows(&logits?, &tolerance)?);
+        }
+        Ok(out)
+    }
+
+    /// Logits of the numbers, `[some items, numbers]`, those of all items in turn.
+    fn number_logits(&self) -> impl Iterator<Item = Result<Tensor>> + '_ {
+        let (items, rows) = (self.sequences.count(), &self.model.number_rows);
+        let step = if self.model.device.is_cpu() { LOGIT_ROWS } else { DEVICE_LOGITS / rows.dims().0.max(1) };
+        let step = step.max(1);
+        (0..items).step_by(step).map(move |first| {
+            let some = self.sequences.last().narrow(0, first, step.min(items - first))?;
+            rows.linear(&some, None)
+        })
     }
 }

@@ -164,10 +164,12 @@ pub fn tensors(files: &FreshFiles, seed: u64) -> Tensors {
     initial(&empty.wanted(), &numbers, layers, seed).unwrap().into_iter().collect()
 }
 
-/// The model of these files and tensors, ready for inference.
+/// The model of these files and tensors on [`super::device`], ready for inference.
 pub fn model(files: &FreshFiles, tensors: Tensors) -> SdimModel {
-    let weights = Weights::from_tensors("test", tensors);
-    SdimModel::new(files.parse().unwrap(), &weights, &Device::Cpu).unwrap().fold().unwrap()
+    let device = super::device();
+    let placed = tensors.into_iter().map(|(name, t)| (name, t.to_device(&device).unwrap()));
+    let weights = Weights::from_tensors("test", placed.collect());
+    SdimModel::new(files.parse().unwrap(), &weights, &device).unwrap().fold().unwrap()
 }
 
 /// Writes a checkpoint directory.

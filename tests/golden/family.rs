@@ -2,9 +2,9 @@
 //!
 //! `tests/reference/make_family.py` says what the files hold and why these shapes.
 
-use super::common::{Allowed, Golden, random};
+use super::common::{Allowed, Golden, device, random, root};
+use super::json;
 use super::stages::Case;
-use super::{CPU, json};
 use candle_core::{DType, Tensor};
 use sdim::WeightFormat;
 use sdim::internals::vlm::checkpoint::weights::Weights;
@@ -14,7 +14,7 @@ use sdim::internals::vlm::qwen2_5::grid::Grid;
 use sdim::internals::vlm::qwen2_5::preprocess::PreprocessorConfig;
 use sdim::settings::RopeLayout;
 use std::collections::HashMap;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 pub const NAMES: [&str; 6] = ["like_3b", "like_7b", "merge_3", "merge_1", "window_1", "window_7"];
 
@@ -28,7 +28,7 @@ pub struct Family {
 
 impl Family {
     pub fn new(name: &'static str) -> Self {
-        let dir = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/family");
+        let dir = root().join("tests/fixtures/family");
         let meta = json(&dir.join(format!("{name}.json")));
         let config = VlmConfig::from_json("config", &meta["config"]).unwrap();
         let preprocessor =
@@ -46,7 +46,7 @@ impl Family {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("model.safetensors");
         candle_core::safetensors::save(&tensors, &path).unwrap();
-        let weights = Weights::from_file(&path, &CPU).unwrap().with_format(format);
+        let weights = Weights::from_file(&path, &device()).unwrap().with_format(format);
         let model = QwenVl::new(self.config.clone(), &weights, RopeLayout::Contiguous).unwrap();
         weights.finish().unwrap();
         model
@@ -57,7 +57,7 @@ impl Family {
         let file = self.meta["images"][letter.to_string()].as_str().unwrap();
         let rgb = sdim::read_rgb(self.dir.join("images").join(file)).unwrap();
         let pixels = self.preprocessor.resize(&rgb).unwrap();
-        (self.preprocessor.patches(&pixels, &CPU).unwrap(), pixels.grid)
+        (self.preprocessor.patches(&pixels, &device()).unwrap(), pixels.grid)
     }
 
     pub fn golden(&self, allowed: Allowed) -> Golden {

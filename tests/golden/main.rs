@@ -1,7 +1,7 @@
 //! Qwen2.5-VL against golden tensors of the reference implementation, stage by stage.
 //!
 //! `tests/fixtures/qwen_small` is written by `tests/reference/make_golden.py`, the models of [`family`] by
-//! `tests/reference/make_family.py`.
+//! `tests/reference/make_family.py`. All but [`formats`] run on the device that `SDIM_TEST_DEVICE` names.
 
 #[path = "../common/mod.rs"]
 mod common;
@@ -24,7 +24,7 @@ use std::path::{Path, PathBuf};
 const CPU: Device = Device::Cpu;
 
 fn own_fixture() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/qwen_small")
+    common::root().join("tests/fixtures/qwen_small")
 }
 
 /// A second set of golden tensors that may lie beside the repository.
@@ -44,7 +44,7 @@ fn load(config: &serde_json::Value, weights: &Weights) -> QwenVl {
 }
 
 fn weights(path: &Path) -> Weights {
-    Weights::from_file(path, &CPU).unwrap()
+    Weights::from_file(path, &common::device()).unwrap()
 }
 
 /// Compares every stage of every case of a directory; `Err` lists what differs.
@@ -61,7 +61,8 @@ fn compare(dir: &Path, config: &serde_json::Value, weights: &Weights) -> Result<
         .collect();
     for case in ["a", "b", "ab"] {
         let pixels: Vec<&Pixels> = case.chars().map(|c| &images[&c]).collect();
-        let patches: Vec<Tensor> = pixels.iter().map(|p| preprocessor.patches(p, &CPU).unwrap()).collect();
+        let patches: Vec<Tensor> =
+            pixels.iter().map(|p| preprocessor.patches(p, &common::device()).unwrap()).collect();
         let grids: Vec<Grid> = pixels.iter().map(|p| p.grid).collect();
         let run = Case { golden: &golden, model: &model, name: case, grids };
         run.check(Some(&Tensor::cat(&patches, 0).unwrap()));
@@ -113,7 +114,7 @@ fn renamed(path: &Path, extra: Option<(&str, Tensor)>) -> Weights {
         .collect();
     out.extend(extra.map(|(name, tensor)| (name.to_string(), tensor)));
     let bytes = safetensors::serialize(&out, None).unwrap();
-    Weights::from_bytes("renamed", bytes, &CPU).unwrap()
+    Weights::from_bytes("renamed", bytes, &common::device()).unwrap()
 }
 
 #[test]

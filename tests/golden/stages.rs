@@ -1,7 +1,6 @@
 //! One prompt through the model, compared with the golden tensors at every stage.
 
-use super::CPU;
-use super::common::{Allowed, Golden};
+use super::common::{Allowed, Golden, device};
 use candle_core::{DType, Tensor};
 use sdim::internals::vlm::chat::generate::GenerateOptions;
 use sdim::internals::vlm::qwen2_5::QwenVl;
@@ -45,7 +44,7 @@ impl Case<'_> {
         let walked = self.indices(&ids);
         let merged = match patches {
             Some(patches) => self.vision(patches),
-            None => Tensor::zeros((0, self.model.config.text.hidden_size), DType::F32, &CPU).unwrap(),
+            None => Tensor::zeros((0, self.model.config.text.hidden_size), DType::F32, &device()).unwrap(),
         };
         let embedded = self.model.embed_prompt(&ids, &merged).unwrap();
         self.close("inputs_embeds", &embedded);
@@ -68,8 +67,8 @@ impl Case<'_> {
         self.exact("cu_seqlens", std::iter::once(0).chain(order.images.iter().map(|w| w.end)));
         let at: Vec<_> = self.grids.iter().flat_map(|g| g.patch_positions(v.merge_size)).collect();
         self.exact("vision_pos_hw", at.iter().flat_map(|&(row, col)| [row, col]));
-        self.table("vision", &vision_table(&at, v.head_dim(), &CPU).unwrap());
-        self.table("text", &self.model.decoder.rope().table(&walked.positions, &CPU).unwrap());
+        self.table("vision", &vision_table(&at, v.head_dim(), &device()).unwrap());
+        self.table("text", &self.model.decoder.rope().table(&walked.positions, &device()).unwrap());
         walked
     }
 
@@ -88,7 +87,7 @@ impl Case<'_> {
 
     fn text(&self, embedded: &Tensor, walked: &PromptPositions) {
         let decoder = &self.model.decoder;
-        let table = decoder.rope().table(&walked.positions, &CPU).unwrap();
+        let table = decoder.rope().table(&walked.positions, &device()).unwrap();
         let (mut own, mut layers) = (decoder.cache(1), Vec::new());
         let context = Context::Cached { shared: None, own: &mut own };
         let hidden = decoder.forward(embedded, &table, context, Some(&mut layers)).unwrap();

@@ -1,5 +1,6 @@
 //! The attention that layers call, and which of its forms computes it.
 
+use super::batched::batched;
 use super::bf16::{AttentionKernel, bf16_attention};
 use super::composed::composed;
 use super::f32::F32Attention;
@@ -7,7 +8,7 @@ use super::layout::{AttentionLayout, Precision};
 use super::shared_keys::SharedKeys;
 use crate::error::Result;
 use crate::kernels::exec::{dims2, expect_dims, on_cpu};
-use candle_core::Tensor;
+use candle_core::{DType, Tensor};
 
 /// `softmax(q k^T / sqrt(head_dim)) v` where each row sees what `layout` says.
 ///
@@ -49,6 +50,12 @@ pub fn attention(
         return attention(q, &k, &v, None, &layout.moved(shared_rows));
     }
     if !on_cpu(&[q, k, v]) || pair.is_some_and(|(sk, sv)| !on_cpu(&[sk, sv])) {
+        let plain = |t: &&Tensor| !t.track_op() && t.dtype() == DType::F32;
+        let all: Vec<&Tensor> =
+            [q, k, v].into_iter().chain(pair.into_iter().flat_map(|(k, v)| [k, v])).collect();
+        if all.iter().all(plain) {
+            return batched(q, k, v, pair, layout);
+        }
         return composed(q, k, v, pair, layout);
     }
     if layout.precision == Precision::Bf16

@@ -1,8 +1,9 @@
 //! Attention over blocks of rows, without masks.
 //!
 //! A `layout` says which row sees which keys, a `plan` cuts the work into tiles of rows and sets of keys, and `dispatch` chooses the form:
-//! `f32` (with gradients), `bf16` (without), or `composed` from candle operations for other devices and types.
+//! `f32` (with gradients), `bf16` (without), or for other devices and types of candle operations: `batched` (without) or `composed` (with).
 
+mod batched;
 mod bf16;
 mod composed;
 mod dispatch;

@@ -3,6 +3,7 @@
 mod activation;
 mod adamw;
 mod add;
+mod bin_rows;
 mod bins;
 mod conv;
 mod linear;
@@ -14,6 +15,7 @@ mod scale_shift;
 pub use activation::{gelu_erf, swiglu};
 pub use adamw::{AdamWStep, adamw_step};
 pub use add::add;
+pub use bin_rows::bin_stats_of_rows;
 pub use bins::{BinStats, bin_stats};
 pub use conv::conv3x3;
 pub use linear::linear;

@@ -2,7 +2,7 @@
 
 use crate::error::Result;
 use crate::kernels::exec::{
-    chunk_rows, dims2, expect_dims, on_cpu, output, read3, slice, sum_in_order, tensor,
+    chunk_rows, dims2, expect_dims, on_cpu, one_kernel, output, read3, slice, sum_in_order, tensor,
 };
 use crate::kernels::isa::{Isa, Level, per_level};
 use crate::kernels::written::written;
@@ -21,11 +21,19 @@ pub fn rms_norm(x: &Tensor, weight: &Tensor, eps: f64) -> Result<Tensor> {
     let (_, d) = dims2("x", x)?;
     expect_dims("weight", weight, &[d])?;
     if !on_cpu(&[x, weight]) {
-        let mean = x.sqr()?.mean_keepdim(D::Minus1)?;
-        return Ok(x.broadcast_div(&(mean + eps)?.sqrt()?)?.broadcast_mul(weight)?);
+        return composed(x, weight, eps);
     }
     let op = RmsNorm { eps: eps as f32 };
     Ok(x.contiguous()?.apply_op2(&weight.contiguous()?, op)?)
+}
+
+/// As one operation of candle's where no gradient is wanted, which that has not.
+fn composed(x: &Tensor, weight: &Tensor, eps: f64) -> Result<Tensor> {
+    if one_kernel(&[x, weight]) {
+        return Ok(candle_nn::ops::rms_norm(&x.contiguous()?, &weight.contiguous()?, eps as f32)?);
+    }
+    let mean = x.sqr()?.mean_keepdim(D::Minus1)?;
+    Ok(x.broadcast_div(&(mean + eps)?.sqrt()?)?.broadcast_mul(weight)?)
 }
 
 struct RmsNorm {
@@ -153,6 +161,18 @@ mod tests {
             let expected = candle_nn::ops::rms_norm(&x, &w, 1e-6).unwrap();
             at_every_level(|| close(&rms_norm(&x, &w, 1e-6).unwrap(), &expected, 1e-5));
         }
+    }
+
+    #[test]
+    fn the_composed_forms_are_the_kernel() {
+        let (x, w) = (random(&[70, 48], 1), random(&[48], 2));
+        let expected = rms_norm(&x, &w, 1e-6).unwrap();
+        let tracked = candle_core::Var::from_tensor(&x).unwrap();
+        for form in [&x, tracked.as_tensor()] {
+            close(&composed(form, &w, 1e-6).unwrap(), &expected, 1e-5);
+        }
+        let rows = x.narrow(0, 0, 0).unwrap();
+        assert_eq!(composed(&rows, &w, 1e-6).unwrap().dims(), [0, 48]);
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! Rotary position embedding.
 
 use crate::error::{Error, Result};
-use crate::kernels::exec::{chunk_rows, dims2, expect_dims, on_cpu, output, read2, slice};
+use crate::kernels::exec::{chunk_rows, dims2, expect_dims, on_cpu, one_kernel, output, read2, slice};
 use crate::kernels::isa::{Isa, Level, per_level};
 use crate::kernels::simd::madd;
 use crate::kernels::written::written;
@@ -32,8 +32,14 @@ pub fn rope(x: &Tensor, cos: &Tensor, sin: &Tensor, heads: usize) -> Result<Tens
     Ok(x.contiguous()?.apply_op1(op)?)
 }
 
+/// As one operation of candle's where no gradient is wanted, which that has not.
 fn composed(x: &Tensor, cos: &Tensor, sin: &Tensor, heads: usize) -> Result<Tensor> {
     let (n, half) = dims2("cos", cos)?;
+    if one_kernel(&[x, cos, sin]) {
+        let x = x.contiguous()?.reshape((1, n, heads, 2 * half))?;
+        let turned = candle_nn::rotary_emb::rope_thd(&x, &cos.contiguous()?, &sin.contiguous()?)?;
+        return Ok(turned.reshape((n, heads * 2 * half))?);
+    }
     let x = x.reshape((n, heads, 2 * half))?;
     let (cos, sin) = (cos.unsqueeze(1)?, sin.unsqueeze(1)?);
     let (a, b) = (x.narrow(2, 0, half)?, x.narrow(2, half, half)?);
@@ -122,8 +128,11 @@ mod tests {
             let angle = random(&[n, hd / 2], 1);
             let (cos, sin) = (angle.cos().unwrap(), angle.sin().unwrap());
             let x = random(&[n, heads * hd], 2);
-            let expected = composed(&x, &cos, &sin, heads).unwrap();
-            at_every_level(|| close(&rope(&x, &cos, &sin, heads).unwrap(), &expected, 1e-6));
+            let tracked = candle_core::Var::from_tensor(&x).unwrap();
+            for form in [&x, tracked.as_tensor()] {
+                let expected = composed(form, &cos, &sin, heads).unwrap();
+                at_every_level(|| close(&rope(&x, &cos, &sin, heads).unwrap(), &expected, 1e-6));
+            }
         }
     }
 

@@ -78,6 +78,25 @@ impl Linear {
         }
     }
 
+    /// Whether [`Linear::forward_rounded`] gives another type than f32.
+    pub(super) fn rounds(&self) -> bool {
+        self.lora.is_none() && self.weight.rounded_type().is_some()
+    }
+
+    /// [`Linear::forward`] in the type in which the matrix is multiplied, for what goes into another product of that type.
+    pub(super) fn forward_rounded(&self, x: &Tensor) -> Result<Tensor> {
+        match (&self.weight, self.rounds()) {
+            (Matrix::Plain(weight), true) => {
+                let y = kernels::linear(&x.to_dtype(weight.dtype())?, weight, None)?;
+                Ok(match &self.bias {
+                    Some(bias) => y.broadcast_add(&bias.to_dtype(weight.dtype())?)?,
+                    None => y,
+                })
+            }
+            _ => self.forward(x),
+        }
+    }
+
     /// [`Linear::forward`] added to `residual`, `[n, out]`.
     ///
     /// # Errors
@@ -162,7 +181,14 @@ impl<const N: usize> JoinedLinear<N> {
     pub fn first<const M: usize>(&self, x: &Tensor) -> Result<[Tensor; M]> {
         let count = M.min(N);
         array(match &self.form {
-            Joined::Apart(layers) => layers[..count].iter().map(|l| l.forward(x)).collect::<Result<_>>()?,
+            Joined::Apart(layers) => {
+                // Rounded once for all of them, if it is.
+                let x = match layers[0].weight.rounded_type() {
+                    Some(dtype) if layers.iter().all(Linear::rounds) => &x.to_dtype(dtype)?,
+                    _ => x,
+                };
+                layers[..count].iter().map(|l| l.forward(x)).collect::<Result<_>>()?
+            }
             Joined::Packed { weight, bias } => {
                 weight.linear_parts(x, bias.as_ref(), &self.outputs[..count])?
             }

@@ -58,7 +58,15 @@ impl Matrix {
         }
     }
 
-    /// `x W^T + b`: `[n, in]` to `[n, out]`, both f32; `bias` is `[out]`.
+    /// The type that activations are rounded to for its product, where that is a plain tensor of another type than f32.
+    pub(super) fn rounded_type(&self) -> Option<DType> {
+        match self {
+            Self::Plain(t) if t.dtype() != DType::F32 => Some(t.dtype()),
+            Self::Plain(_) | Self::Packed(_) => None,
+        }
+    }
+
+    /// `x W^T + b`: `[n, in]`, f32 or the matrix's type, to `[n, out]`, f32; `bias` is `[out]`.
     ///
     /// # Errors
     /// [`Error::Argument`] or [`Error::Tensors`] on another width.

@@ -47,6 +47,12 @@ impl GatedMlp {
                 return kernels::packed_mlp(both, x, down, bias.as_ref(), residual);
             }
             (GateUp::Joined(both), _) => both.apply(x)?,
+            // Off the CPU: what lies between two products of one type need not leave it.
+            (GateUp::Apart { gate, up }, down) if [gate, up, down].iter().all(|l| l.rounds()) => {
+                let x =
+                    gate.weight.rounded_type().map_or_else(|| Ok(x.clone()), |dtype| x.to_dtype(dtype))?;
+                kernels::swiglu(&gate.forward_rounded(&x)?, &up.forward_rounded(&x)?)?
+            }
             (GateUp::Apart { gate, up }, _) => kernels::swiglu(&gate.forward(x)?, &up.forward(x)?)?,
         };
         self.down.forward_onto(&gated, residual)

@@ -23,6 +23,11 @@ impl RopeTable {
         })
     }
 
+    /// The same of angles on a device.
+    fn from_tensor(angles: &Tensor) -> Result<Self> {
+        Ok(Self { cos: angles.cos()?, sin: angles.sin()? })
+    }
+
     /// Rows of the table in another order.
     ///
     /// # Errors
@@ -116,11 +121,50 @@ impl MRope {
     /// # Errors
     /// [`crate::Error::Tensors`] if the device refuses the table.
     pub fn table(&self, positions: &[Position], device: &Device) -> Result<RopeTable> {
+        if !device.is_cpu() {
+            return RopeTable::from_tensor(&self.angles(positions, device)?);
+        }
         let half = self.inverse.len();
         let mut angles = Vec::with_capacity(positions.len() * half);
         for p in positions {
             angles.extend(self.inverse.iter().zip(&self.axis).map(|(f, &a)| p.axis(a) * f));
         }
         RopeTable::from_angles(angles, positions.len(), half, device)
+    }
+
+    /// Angles of these positions, `[tokens, head_dim / 2]`, as a product: each column has one frequency, at its axis. So three numbers of each
+    /// token go to the device.
+    fn angles(&self, positions: &[Position], device: &Device) -> Result<Tensor> {
+        let half = self.inverse.len();
+        let places: Vec<f32> = positions.iter().flat_map(|p| [p.t, p.h, p.w]).collect();
+        let mut frequencies = vec![0f32; 3 * half];
+        for (k, (f, &axis)) in self.inverse.iter().zip(&self.axis).enumerate() {
+            frequencies[axis * half + k] = *f;
+        }
+        let places = Tensor::from_vec(places, (positions.len(), 3), device)?;
+        Ok(places.matmul(&Tensor::from_vec(frequencies, (3, half), device)?)?)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn angles_as_a_product_give_the_same_table() {
+        let json =
+            serde_json::from_str(include_str!("../../../tests/fixtures/qwen_small/config.json")).unwrap();
+        let config = crate::vlm::qwen2_5::config::VlmConfig::from_json("config.json", &json).unwrap().text;
+        let positions: Vec<Position> =
+            (0..50).map(|i| Position { t: i as f32, h: i as f32 * 1.25, w: 40.0 - i as f32 * 0.5 }).collect();
+        for layout in [RopeLayout::Contiguous, RopeLayout::Interleaved] {
+            let rope = MRope::new(&config, layout);
+            let wanted = rope.table(&positions, &Device::Cpu).unwrap();
+            let found = RopeTable::from_tensor(&rope.angles(&positions, &Device::Cpu).unwrap()).unwrap();
+            for (a, b) in [(&found.cos, &wanted.cos), (&found.sin, &wanted.sin)] {
+                let largest = (a - b).unwrap().abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap();
+                assert!(largest < 1e-6, "{layout:?}: {largest}");
+            }
+        }
     }
 }

@@ -1,0 +1,253 @@
+//! Attention on a device without kernels of ours, where no gradient is wanted: few large products, no more scores at once than fit.
+
+use super::layout::{AttentionLayout, Block};
+use crate::error::Result;
+use candle_core::{DType, Device, Tensor};
+use std::sync::{Mutex, PoisonError};
+
+/// Scores that are held at once, at most: 512 MB, and as much again for their softmax.
+const MAX_SCORES: usize = 1 << 27;
+
+/// [`attention()`](super::attention) of f32 tensors that fit the layout, `shared` being the extra pair.
+pub(super) fn batched(
+    q: &Tensor,
+    k: &Tensor,
+    v: &Tensor,
+    shared: Option<(&Tensor, &Tensor)>,
+    layout: &AttentionLayout,
+) -> Result<Tensor> {
+    in_pieces(q, [k, v], shared.unwrap_or((k, v)).into(), layout, MAX_SCORES)
+}
+
+fn in_pieces(
+    q: &Tensor,
+    own: [&Tensor; 2],
+    shared: [&Tensor; 2],
+    layout: &AttentionLayout,
+    most: usize,
+) -> Result<Tensor> {
+    let (rows, width) = (q.dim(0)?, layout.heads * layout.head_dim);
+    let (mut parts, mut at) = (Vec::new(), 0);
+    let zeros = |rows: usize| Tensor::zeros((rows, width), q.dtype(), q.device());
+    for block in joined(&layout.blocks) {
+        for piece in pieces(&block, layout.heads, most) {
+            if piece.queries.start > at {
+                parts.push(zeros(piece.queries.start - at)?);
+            }
+            at = piece.queries.end;
+            parts.push(one_piece(q, own, shared, layout, &piece)?);
+        }
+    }
+    if at < rows || parts.is_empty() {
+        parts.push(zeros(rows - at)?);
+    }
+    Ok(if parts.len() == 1 { parts.swap_remove(0) } else { Tensor::cat(&parts, 0)? })
+}
+
+/// The blocks that have rows, in order; those that go on where the one before ends, with items of the same kind, as one: windows of a
+/// picture.
+fn joined(blocks: &[Block]) -> Vec<Block> {
+    let mut sorted: Vec<&Block> = blocks.iter().filter(|b| !b.queries.is_empty()).collect();
+    sorted.sort_by_key(|b| b.queries.start);
+    let mut out: Vec<Block> = Vec::new();
+    for block in sorted {
+        match out.last_mut() {
+            Some(last) if goes_on(last, block) => last.queries.end = block.queries.end,
+            _ => out.push(block.clone()),
+        }
+    }
+    out
+}
+
+fn goes_on(last: &Block, next: &Block) -> bool {
+    let kind = |b: &Block| (b.shared.clone(), b.q_period, b.k_period, b.causal);
+    kind(last) == kind(next)
+        && next.queries.start == last.queries.end
+        && next.own_start == last.own_start + last.items() * last.k_period
+}
+
+/// A block in parts of at most so many scores, or of one row.
+fn pieces(block: &Block, heads: usize, most: usize) -> Vec<Block> {
+    let rows = (most / (heads * (block.shared.len() + block.k_period)).max(1)).max(1);
+    let (qp, kp, start) = (block.q_period, block.k_period, block.queries.start);
+    let mut out = Vec::new();
+    if rows >= qp {
+        let (step, items) = (rows / qp, block.items());
+        for first in (0..items).step_by(step) {
+            let last = (first + step).min(items);
+            let queries = start + first * qp..start + last * qp;
+            out.push(Block { queries, own_start: block.own_start + first * kp, ..block.clone() });
+        }
+        return out;
+    }
+    for item in 0..block.items() {
+        for first in (0..qp).step_by(rows) {
+            let last = (first + rows).min(qp);
+            let from = start + item * qp;
+            out.push(Block {
+                queries: from + first..from + last,
+                own_start: block.own_start + item * kp,
+                q_period: last - first,
+                k_period: if block.causal { block.seen(last - 1) } else { kp },
+                ..block.clone()
+            });
+        }
+    }
+    out
+}
+
+/// Scores against shared and own keys side by side in one tensor, one softmax.
+fn one_piece(
+    q: &Tensor,
+    own: [&Tensor; 2],
+    shared: [&Tensor; 2],
+    layout: &AttentionLayout,
+    block: &Block,
+) -> Result<Tensor> {
+    let AttentionLayout { heads, kv_heads, head_dim: hd, .. } = *layout;
+    let (items, group, qp, kp) = (block.items(), heads / kv_heads, block.q_period, block.k_period);
+    let (rows, n_shared) = (block.queries.len(), block.shared.len());
+    let q = (q.narrow(0, block.queries.start, rows)? * (1.0 / (hd as f64).sqrt()))?
+        .reshape((items, qp, kv_heads, group, hd))?
+        .permute((2, 0, 3, 1, 4))?
+        .contiguous()?;
+    let heads_first = |t: &Tensor| {
+        let own = t.narrow(0, block.own_start, items * kp)?;
+        own.reshape((items, kp, kv_heads, hd))?.permute((2, 0, 1, 3))?.contiguous()
+    };
+    let by_item = (kv_heads, items, group * qp, ());
+    let own_scores = |k: &Tensor| -> Result<Tensor> {
+        let scores =
+            q.reshape((kv_heads, items, group * qp, hd))?.matmul(&heads_first(k)?.transpose(2, 3)?)?;
+        if !block.causal || qp == 1 {
+            return Ok(scores); // All are seen.
+        }
+        let scores = scores.reshape((kv_heads * items * group, qp, kp))?;
+        Ok(scores.broadcast_add(&mask(block, q.device())?)?)
+    };
+    let out = if n_shared == 0 {
+        let scores = own_scores(own[0])?.reshape(by_item)?;
+        candle_nn::ops::softmax_last_dim(&scores)?.matmul(&heads_first(own[1])?)?
+    } else {
+        let before = |t: &Tensor| -> candle_core::Result<Tensor> {
+            let t = t.narrow(0, block.shared.start, n_shared)?.reshape((n_shared, kv_heads, hd))?;
+            // Room for the own keys: their scores go there, and what their probabilities meet here adds nothing.
+            t.permute((1, 0, 2))?.contiguous()?.pad_with_zeros(1, 0, kp)?.contiguous()
+        };
+        let all = items * group * qp;
+        let scores = q.reshape((kv_heads, all, hd))?.matmul(&before(shared[0])?.transpose(1, 2)?)?;
+        if kp > 0 {
+            let own = own_scores(own[0])?.reshape((kv_heads, all, kp))?.contiguous()?;
+            scores.slice_set(&own, 2, n_shared)?;
+        }
+        let p = candle_nn::ops::softmax_last_dim(&scores)?;
+        let mut out = p.matmul(&before(shared[1])?)?;
+        if kp > 0 {
+            let p = p.narrow(2, n_shared, kp)?.contiguous()?.reshape(by_item)?;
+            out = (out + p.matmul(&heads_first(own[1])?)?.reshape((kv_heads, all, hd))?)?;
+        }
+        out
+    };
+    let out = out.reshape((kv_heads, items, group, qp, hd))?.permute((1, 3, 0, 2, 4))?.contiguous()?;
+    Ok(out.reshape((rows, heads * hd))?)
+}
+
+/// 0 where a row sees a key of its item, minus infinity where not: `[q_period, k_period]`. The last one is kept: all layers of a model
+/// ask for the same.
+fn mask(block: &Block, device: &Device) -> Result<Tensor> {
+    static LAST: Mutex<Option<Tensor>> = Mutex::new(None);
+    let (qp, kp) = (block.q_period, block.k_period);
+    let mut last = LAST.lock().unwrap_or_else(PoisonError::into_inner);
+    if let Some(mask) = last.as_ref()
+        && mask.dims() == [qp, kp]
+        && mask.device().same_device(device)
+    {
+        return Ok(mask.clone());
+    }
+    let values: Vec<f32> =
+        (0..qp * kp).map(|at| if at % kp < block.seen(at / kp) { 0.0 } else { f32::NEG_INFINITY }).collect();
+    let mask = Tensor::from_vec(values, (qp, kp), device)?.to_dtype(DType::F32)?;
+    *last = Some(mask.clone());
+    Ok(mask)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::composed::composed;
+    use super::super::layout::Precision;
+    use super::*;
+    use crate::kernels::testing::{close, random};
+
+    fn block(
+        queries: std::ops::Range<usize>,
+        own_start: usize,
+        periods: (usize, usize),
+        causal: bool,
+    ) -> Block {
+        let (q_period, k_period) = periods;
+        Block { queries, shared: 0..0, own_start, q_period, k_period, causal }
+    }
+
+    fn layout(blocks: Vec<Block>) -> AttentionLayout {
+        AttentionLayout { heads: 6, kv_heads: 2, head_dim: 8, blocks, precision: Precision::F32 }
+    }
+
+    /// Windows, a causal prompt, answers in progress after a prefix, one token after a prefix, a prefix alone; gaps before and after.
+    fn cases() -> Vec<(AttentionLayout, bool)> {
+        let prefix = |b: Block, shared| Block { shared, ..b };
+        let windows = [0..16, 16..32, 32..40, 40..48, 48..50];
+        vec![
+            (
+                layout(
+                    windows
+                        .into_iter()
+                        .map(|w| block(w.clone(), w.start, (w.len(), w.len()), false))
+                        .collect(),
+                ),
+                false,
+            ),
+            (layout(vec![block(3..33, 0, (30, 30), true)]), false),
+            (layout(vec![prefix(block(0..36, 0, (3, 5), true), 2..9)]), true),
+            (layout(vec![prefix(block(0..40, 0, (1, 1), true), 0..20)]), true),
+            (layout(vec![prefix(block(1..9, 0, (1, 0), false), 0..20)]), true),
+            (layout(vec![prefix(block(20..41, 20, (3, 3), true), 0..20)]), false),
+            (layout(vec![]), false),
+        ]
+    }
+
+    #[test]
+    fn it_is_the_composed_form_in_pieces_of_any_size() {
+        for (layout, pair) in cases() {
+            let (q, k, v) = (random(&[50, 48], 1), random(&[70, 16], 2), random(&[70, 16], 3));
+            let extra = pair.then(|| (random(&[20, 16], 4), random(&[20, 16], 5)));
+            let extra = extra.as_ref().map(|(k, v)| (k, v));
+            let expected = composed(&q, &k, &v, extra, &layout).unwrap();
+            close(&batched(&q, &k, &v, extra, &layout).unwrap(), &expected, 1e-5);
+            let shared = extra.unwrap_or((&k, &v)).into();
+            for most in [1, 200, 700, 2000] {
+                close(&in_pieces(&q, [&k, &v], shared, &layout, most).unwrap(), &expected, 1e-5);
+            }
+        }
+    }
+
+    #[test]
+    fn windows_of_one_size_are_one_block_and_pieces_hold_no_more_than_they_may() {
+        let windows = [0..16, 16..32, 32..40, 40..48, 48..50];
+        let blocks: Vec<Block> =
+            windows.into_iter().map(|w| block(w.clone(), w.start, (w.len(), w.len()), false)).collect();
+        let found: Vec<_> = joined(&blocks).iter().map(|b| (b.queries.clone(), b.q_period)).collect();
+        assert_eq!(found, [(0..32, 16), (32..48, 8), (48..50, 2)]);
+        // Keys that do not go on, and another prefix.
+        assert_eq!(joined(&[block(0..4, 0, (4, 4), true), block(4..8, 5, (4, 4), true)]).len(), 2);
+        let other = Block { shared: 0..3, ..block(4..8, 4, (4, 4), true) };
+        assert_eq!(joined(&[block(0..4, 0, (4, 4), true), other]).len(), 2);
+
+        let long = block(0..1000, 0, (1000, 1000), true);
+        let parts = pieces(&long, 2, 100_000);
+        assert_eq!((parts.len(), parts[3].queries.clone(), parts[3].k_period), (20, 150..200, 200));
+        assert!(parts.iter().all(|p| p.queries.len() * p.k_period * 2 <= 100_000));
+        let many = Block { shared: 0..90, ..block(0..1000, 0, (5, 10), true) };
+        let parts = pieces(&many, 4, 10_000);
+        assert_eq!((parts.len(), parts[1].queries.clone(), parts[1].own_start), (40, 25..50, 50));
+    }
+}

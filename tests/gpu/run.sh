@@ -1,0 +1,114 @@
+#!/usr/bin/env bash
+# Checks sdim on a CUDA device: answers against the CPU's, the golden tensors, repeats from several threads, times.
+#
+#   bash tests/gpu/run.sh [SECONDS]     200 if nothing is said; all ends within them, the most important first
+#
+# Beside it, or in out/: payload.tar.xz of pack.sh. Needs a driver, Python, and CUDA's run-time libraries (PyTorch's wheels have
+# them). Prints a table; everything else goes to $OUT.
+set -u
+here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
+budget=${1:-200}
+out=${OUT:-$here/out/results}
+mkdir -p "$out/logs"
+table=$out/table.txt
+: >"$table"
+
+remaining() { echo $((budget - SECONDS)); }
+note() { printf '%s\n' "$*" >>"$table"; }
+
+payload=$here/payload.tar.xz
+[ -e "$payload" ] || payload=$here/out/payload.tar.xz
+work=$(mktemp -d "${TMPDIR:-/tmp}/sdim-gpu.XXXXXX")
+if ! python3 -c 'import sys, tarfile; tarfile.open(sys.argv[1]).extractall(sys.argv[2])' "$payload" "$work" 2>"$out/logs/unpack.log"; then
+    tail -n 3 "$out/logs/unpack.log"
+    exit 1
+fi
+
+# The driver compiles candle's PTX at the first use of each kernel, and keeps what it made here.
+export CUDA_CACHE_PATH=$work/ptx CUDA_CACHE_MAXSIZE=4000000000
+# Where the tests look for their fixtures.
+export CARGO_MANIFEST_DIR=$work
+export LD_LIBRARY_PATH=$(python3 "$work/libraries.py")${LD_LIBRARY_PATH:+:$LD_LIBRARY_PATH}
+
+# check NAME LIMIT COMMAND...: runs it, at most LIMIT seconds and never beyond what is left; a line of the table says how it ended.
+check() {
+    local name=$1 limit=$2 log=$out/logs/$1.log left began code
+    shift 2
+    left=$(($(remaining) - 5))
+    if [ "$left" -lt 5 ]; then
+        note "$(printf '%-22s left out: no time' "$name")"
+        return 1
+    fi
+    [ "$limit" -lt "$left" ] || limit=$left
+    began=$(date +%s%N)
+    timeout --kill-after=2 "$limit" "$@" >"$log" 2>"$log.err" </dev/null
+    code=$?
+    local ended=ok
+    [ $code = 0 ] || ended="FAILED ($code)"
+    [ $code != 124 ] || ended="STOPPED after $limit s"
+    note "$(printf '%-22s %-22s %6.1f s' "$name" "$ended" "$(((($(date +%s%N) - began)) / 1000000))e-3")"
+    if [ $code != 0 ]; then
+        grep -ahE 'panicked|rror|differ|assert|FAILED|fails' "$log" "$log.err" | cut -c1-220 | awk '!seen[$0]++' | head -n 6 | sed 's/^/    /' >>"$table"
+    fi
+    return $code
+}
+
+# tests NAME LIMIT PROGRAM [ARGUMENT...]: tests on the device.
+tests() {
+    local name=$1 limit=$2 program=$3
+    shift 3
+    check "$name" "$limit" env SDIM_TEST_DEVICE=cuda:0 "$work/bin/test-$program" --nocapture "$@"
+    grep -ahE '^test result' "$out/logs/$name.log" | cut -c1-120 | sed 's/^/    /' >>"$table"
+}
+
+frame() {
+    local name=$1 limit=$2
+    shift 2
+    check "$name" "$limit" "$work/bin/complete" --rgb "$work/assets/example/rgb.png" --sparse "$work/assets/example/sparse.png" \
+        --gt "$work/assets/example/gt.png" --depth-scale mm --json --out "$out/maps/$name" "$@"
+    python3 "$work/report.py" frame "$out/logs/$name.log" >>"$table"
+}
+
+model() {
+    local name=$1 limit=$2
+    shift 2
+    check "$name" "$limit" "$work/bin/throughput" --device cuda:0 --json "$@"
+    python3 "$work/report.py" model "$out/logs/$name.log" >>"$table"
+}
+
+compare() { note "$(printf '    %s against %s: %s' "$2" "$1" "$(python3 "$work/report.py" maps "$out/maps/$1/dense.npy" "$out/maps/$2/dense.npy" 2>&1 | tail -n 1)")"; }
+
+{
+    nvidia-smi --query-gpu=name,driver_version,memory.total,memory.used --format=csv,noheader
+    nproc
+    ldd "$work/bin/complete" | grep -E 'libcu|not found'
+} >"$out/logs/machine.log" 2>&1
+note "$(head -n 1 "$out/logs/machine.log"), $(nproc) CPU cores"
+grep 'not found' "$out/logs/machine.log" | sed 's/^/    /' >>"$table"
+
+# One run after the other pays for the kernels that it is the first to use.
+frame cpu-f32 20 --device cpu --weights f32 --repeat 2
+frame cuda-f32-first 75 --device cuda:0 --weights f32
+compare cpu-f32 cuda-f32-first
+frame cuda-bf16 40 --device cuda:0 --weights bf16 --repeat 2
+compare cpu-f32 cuda-bf16
+tests golden 45 golden --skip formats --test-threads 4
+tests device 45 device --test-threads 2
+model 3b-bf16 60 --random 3b --weights bf16 --queries 4096 --batch 2048 --rounds 3
+frame stride4-f32 15 --device cuda:0 --weights f32 --plan stride:4 --repeat 4
+frame stride4-bf16 15 --device cuda:0 --weights bf16 --plan stride:4 --repeat 4
+frame every-bf16 20 --device cuda:0 --weights bf16 --plan every --repeat 3
+frame every-f32 20 --device cuda:0 --weights f32 --plan every --repeat 3
+tests shared_prefix 30 shared_prefix
+tests fusion 15 fusion
+tests complete 25 complete
+tests bad_checkpoint 20 bad_checkpoint
+model 3b-one-token 30 --random 3b --weights bf16 --queries 8192 --batch 4096 --digits 1 --rounds 2
+frame every-cpu 25 --device cpu --weights f32 --plan every
+compare every-cpu every-f32
+model 3b-batch512 30 --random 3b --weights bf16 --queries 1024 --batch 512 --rounds 2
+
+cp "$table" "$out/table.full.txt"
+head -c 10500 "$table"
+printf '%s s of %s; logs in %s\n' "$SECONDS" "$budget" "$out"
+rm -rf "$work"
