@@ -9,11 +9,14 @@ use anyhow::Context;
 use clap::Parser;
 use common::{load_as, load_options, rounded, stdout};
 use indicatif::{ProgressBar, ProgressStyle};
-use sdim::depth::interpolate;
+use sdim::depth::{Saturation, interpolate};
 use sdim::draw::preview;
 use sdim::metrics::{Errors, errors};
 use sdim::system::{device_memory_bytes, peak_rss_bytes};
-use sdim::{CompleteOptions, DepthScale, QueryPlan, SparseDepth, WeightFormat, read_rgb};
+use sdim::{
+    CompleteOptions, Completion, DepthScale, Device, Outliers, QueryPlan, Readout, RgbImage, SparseDepth,
+    WeightFormat, read_rgb,
+};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -44,6 +47,12 @@ struct Args {
     /// Pixels to ask: every, stride:N or budget:N.
     #[arg(long, default_value_t = Default::default())]
     plan: QueryPlan,
+    /// What an answer's distribution is read as: median or mean.
+    #[arg(long, default_value_t = Default::default())]
+    readout: Readout,
+    /// What becomes of contradicted measurements: trust, ignore or preserve.
+    #[arg(long, default_value_t = Default::default())]
+    outliers: Outliers,
     /// cpu, cuda:N or metal.
     #[arg(long, default_value = "cpu")]
     device: String,
@@ -102,103 +111,154 @@ fn main() -> anyhow::Result<()> {
     let inputs = args.inputs();
     let start = Instant::now();
     let options = load_options(&args.device, args.weights, args.adapter.as_deref())?;
-    let on = options.device.clone();
+    let device = options.device.clone();
     let completer = load_as(&args.model, &options)?;
-    let rgb = read_rgb(&inputs.rgb)?;
-    let sparse = SparseDepth::read(&inputs.sparse, inputs.scale)?;
-    let gt = inputs.gt.as_ref().map(|p| SparseDepth::read(p, inputs.scale)).transpose()?;
-    for (path, map) in [(Some(&inputs.sparse), Some(&sparse)), (inputs.gt.as_ref(), gt.as_ref())] {
-        if let (Some(path), Some(map)) = (path, map) {
+    let frame = inputs.read()?;
+    let load_seconds = start.elapsed().as_secs_f64();
+
+    let bar = bar()?;
+    let ticker = bar.clone();
+    let options = CompleteOptions::default()
+        .with_plan(args.plan)
+        .with_readout(args.readout)
+        .with_outliers(args.outliers)
+        .with_progress(move |p| {
+            ticker.set_length(p.planned as u64);
+            ticker.set_position(p.answered as u64);
+        });
+    let mut done = completer.complete_detailed(&frame.rgb, &frame.sparse, &options)?;
+    let first_seconds = done.seconds.total;
+    for _ in 1..args.repeat {
+        done = completer.complete_detailed(&frame.rgb, &frame.sparse, &options)?;
+    }
+    bar.finish_and_clear();
+    let run = Run { scores: frame.scores(&done)?, frame, done, device, load_seconds, first_seconds };
+    let saturation = run.write(&args.out, inputs.scale.unwrap_or(DepthScale::millimetres()))?;
+    let text = match args.json {
+        true => run.json().to_string(),
+        false => run.summary(&saturation, &args.out),
+    };
+    stdout::print(&text)?;
+    Ok(())
+}
+
+/// What is completed.
+struct Frame {
+    rgb: RgbImage,
+    sparse: SparseDepth,
+    gt: Option<SparseDepth>,
+}
+
+impl Inputs {
+    /// The files; depth of another size than the picture's is an error that names its file.
+    fn read(&self) -> anyhow::Result<Frame> {
+        let rgb = read_rgb(&self.rgb)?;
+        let depth = |path: &Path| {
+            let map = SparseDepth::read(path, self.scale)?;
             let sizes = [(map.width(), map.height()), (rgb.width() as usize, rgb.height() as usize)];
             let [depth, picture] = sizes.map(|(w, h)| format!("{w}x{h}"));
             anyhow::ensure!(
                 depth == picture,
                 "{}: {depth} pixels; expected {picture} as {}",
                 path.display(),
-                inputs.rgb.display()
+                self.rgb.display()
             );
-        }
+            Ok(map)
+        };
+        let (sparse, gt) = (depth(&self.sparse)?, self.gt.as_deref().map(depth).transpose()?);
+        Ok(Frame { rgb, sparse, gt })
     }
-    let load_seconds = start.elapsed().as_secs_f64();
+}
 
-    let bar = bar()?;
-    let ticker = bar.clone();
-    let options = CompleteOptions::default().with_plan(args.plan).with_progress(move |p| {
-        ticker.set_length(p.planned as u64);
-        ticker.set_position(p.answered as u64);
-    });
-    let mut done = completer.complete_detailed(&rgb, &sparse, &options)?;
-    let first_seconds = done.seconds.total;
-    for _ in 1..args.repeat {
-        done = completer.complete_detailed(&rgb, &sparse, &options)?;
+impl Frame {
+    /// Errors of the model and of the nearest neighbour, where there is ground truth beside what was given as input.
+    fn scores(&self, done: &Completion) -> anyhow::Result<Option<(Errors, Errors)>> {
+        let open = |gt: &&SparseDepth| gt.points().any(|(x, y, _)| self.sparse.get(x, y).is_none());
+        let Some(gt) = self.gt.as_ref().filter(open) else { return Ok(None) };
+        let score = |depth: &[f32]| errors(depth, gt.as_slice(), &self.sparse);
+        Ok(Some((score(done.map.depth())?, score(&interpolate::nearest(&self.sparse)?)?)))
     }
-    bar.finish_and_clear();
-    let scores = match &gt {
-        // Where everything was given as input there is nothing to score.
-        Some(gt) if gt.points().any(|(x, y, _)| sparse.get(x, y).is_none()) => {
-            let score = |depth: &[f32]| errors(depth, gt.as_slice(), &sparse);
-            Some((score(done.map.depth())?, score(&interpolate::nearest(&sparse)?)?))
-        }
-        _ => None,
-    };
+}
 
-    std::fs::create_dir_all(&args.out).with_context(|| args.out.display().to_string())?;
-    let out = |name: &str| args.out.join(name);
-    let scale = inputs.scale.unwrap_or(DepthScale::millimetres());
-    let saturation = done.map.write_png16(out("dense.png"), scale)?;
-    done.map.write_npy(out("dense.npy"))?;
-    done.map.write_confidence_npy(out("confidence.npy"))?;
-    preview::write_panel(out("preview.png"), &rgb, &sparse, &done.map, gt.as_ref().map(|g| g.as_slice()))?;
+/// A completed frame with everything that is said about it.
+struct Run {
+    frame: Frame,
+    done: Completion,
+    scores: Option<(Errors, Errors)>,
+    device: Device,
+    load_seconds: f64,
+    first_seconds: f64,
+}
 
-    let (map, s) = (&done.map, &done.seconds);
-    let per_second = done.asked as f64 / s.queries.max(1e-9);
-    if args.json {
+impl Run {
+    /// Writes maps and preview.
+    fn write(&self, dir: &Path, scale: DepthScale) -> anyhow::Result<Saturation> {
+        std::fs::create_dir_all(dir).with_context(|| dir.display().to_string())?;
+        let (map, frame) = (&self.done.map, &self.frame);
+        let saturation = map.write_png16(dir.join("dense.png"), scale)?;
+        map.write_npy(dir.join("dense.npy"))?;
+        map.write_confidence_npy(dir.join("confidence.npy"))?;
+        let gt = frame.gt.as_ref().map(|g| g.as_slice());
+        preview::write_panel(dir.join("preview.png"), &frame.rgb, &frame.sparse, map, gt)?;
+        Ok(saturation)
+    }
+
+    fn queries_per_second(&self) -> f64 {
+        self.done.asked as f64 / self.done.seconds.queries.max(1e-9)
+    }
+
+    fn json(&self) -> Value {
+        let (map, s) = (&self.done.map, &self.done.seconds);
         let mut object = json!({
-            "width": map.width(), "height": map.height(), "measured": sparse.measured(),
-            "asked": done.asked, "valid": map.valid(), "flagged": done.flagged.len(),
+            "width": map.width(), "height": map.height(), "measured": self.frame.sparse.measured(),
+            "asked": self.done.asked, "valid": map.valid(), "flagged": self.done.flagged.len(),
             "seconds": {
-                "load": load_seconds, "check": s.check, "encode": s.encode, "prefill": s.prefill,
-                "queries": s.queries, "refine": s.refine, "total": s.total, "first_total": first_seconds,
+                "load": self.load_seconds, "check": s.check, "encode": s.encode, "prefill": s.prefill,
+                "queries": s.queries, "refine": s.refine, "total": s.total, "first_total": self.first_seconds,
             },
-            "queries_per_second": per_second, "peak_rss_bytes": peak_rss_bytes(),
-            "device_memory_bytes": device_memory_bytes(&on),
+            "queries_per_second": self.queries_per_second(), "peak_rss_bytes": peak_rss_bytes(),
+            "device_memory_bytes": device_memory_bytes(&self.device),
         });
-        if let Some((model, nearest)) = &scores {
+        if let Some((model, nearest)) = &self.scores {
             for (key, value) in error_json(model).as_object().into_iter().flatten() {
                 object[key] = value.clone();
             }
             object["nearest"] = error_json(nearest);
         }
-        stdout::print(&object.to_string())?;
-        return Ok(());
+        object
     }
-    let mut lines = vec![format!(
-        "{}x{}: {} measured, {} asked, {} of {} pixels valid, in {:.2} s (load {:.2} s, {:.0} queries/s)",
-        map.width(),
-        map.height(),
-        sparse.measured(),
-        done.asked,
-        map.valid(),
-        map.width() * map.height(),
-        s.total,
-        load_seconds,
-        per_second
-    )];
-    if let Some((model, nearest)) = &scores {
-        let [model, nearest] = [model.mae, nearest.mae].map(rounded);
-        lines.push(format!("error   MAE {model} m (nearest neighbour {nearest} m)"));
+
+    fn summary(&self, saturation: &Saturation, out: &Path) -> String {
+        let (map, s) = (&self.done.map, &self.done.seconds);
+        let mut lines = vec![format!(
+            "{}x{}: {} measured, {} asked, {} of {} pixels valid, in {:.2} s (load {:.2} s, {:.0} queries/s)",
+            map.width(),
+            map.height(),
+            self.frame.sparse.measured(),
+            self.done.asked,
+            map.valid(),
+            map.width() * map.height(),
+            s.total,
+            self.load_seconds,
+            self.queries_per_second()
+        )];
+        if let Some((model, nearest)) = &self.scores {
+            let [model, nearest] = [model.mae, nearest.mae].map(rounded);
+            lines.push(format!("error   MAE {model} m (nearest neighbour {nearest} m)"));
+        }
+        if !self.done.flagged.is_empty() {
+            let flagged = self.done.flagged.len();
+            lines.push(format!(
+                "note    {flagged} measurements contradict those around them and were left out"
+            ));
+        }
+        if saturation.pixels > 0 {
+            let pixels = saturation.pixels;
+            lines.push(format!(
+                "note    {pixels} pixels are beyond the range of dense.png; dense.npy has them"
+            ));
+        }
+        lines.push(format!("wrote   {}", out.display()));
+        lines.join("\n")
     }
-    if !done.flagged.is_empty() {
-        let flagged = done.flagged.len();
-        lines.push(format!("note    {flagged} measurements contradict those around them and were left out"));
-    }
-    if saturation.pixels > 0 {
-        lines.push(format!(
-            "note    {} pixels are beyond the range of dense.png; dense.npy has them",
-            saturation.pixels
-        ));
-    }
-    lines.push(format!("wrote   {}", args.out.display()));
-    stdout::print(&lines.join("\n"))?;
-    Ok(())
 }

@@ -124,7 +124,7 @@ pub use depth::{DepthMap, DepthScale, Intrinsics, SparseDepth};
 pub use error::{Error, Result};
 pub use kernels::WeightFormat;
 pub use model::Adapter;
-pub use query::QueryPlan;
+pub use query::{QueryPlan, Readout};
 pub use vlm::checkpoint::LoadOptions;
 
 /// What `sdim.json` says: how a checkpoint is asked, and what an adapter adds to it.

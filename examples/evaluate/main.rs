@@ -47,7 +47,7 @@ use anyhow::{Context, bail, ensure};
 use clap::Parser;
 use sdim::benchmarks::Layout;
 use sdim::depth::SparsePattern;
-use sdim::{DepthScale, LoadOptions, QueryPlan, WeightFormat};
+use sdim::{DepthScale, LoadOptions, Outliers, QueryPlan, Readout, WeightFormat};
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 use std::str::FromStr;
@@ -118,6 +118,12 @@ pub struct Args {
     /// Pixels to ask: every, stride:N or budget:N.
     #[arg(long, default_value_t = Default::default())]
     plan: QueryPlan,
+    /// What an answer's distribution is read as: median or mean.
+    #[arg(long, default_value_t = Default::default())]
+    readout: Readout,
+    /// What becomes of contradicted measurements: trust, ignore or preserve.
+    #[arg(long, default_value_t = Default::default())]
+    outliers: Outliers,
     /// How matrices of checkpoints are held: f32, bf16 or int8; without it, what this machine multiplies best.
     #[arg(long)]
     weights: Option<WeightFormat>,
@@ -133,7 +139,7 @@ pub struct Args {
     /// Make the report of finished runs or shards instead of running; into --out if given.
     #[arg(long, num_args = 1.., value_name = "DIR", conflicts_with_all = [
         "data", "procedural", "furnished", "library", "layout", "depth_scale", "range", "frame_list", "points", "pattern", "resample", "score", "seed", "limit",
-        "checkpoint", "adapter", "methods", "plan", "weights", "device", "shard", "figures", "verbose"])]
+        "checkpoint", "adapter", "methods", "plan", "readout", "outliers", "weights", "device", "shard", "figures", "verbose"])]
     merge: Vec<PathBuf>,
     /// Draw the first frames into this folder, all methods and their errors beside each other.
     #[arg(long)]

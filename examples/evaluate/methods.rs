@@ -77,7 +77,10 @@ pub fn load_all(args: &Args) -> anyhow::Result<Vec<Method>> {
     for (checkpoint, name) in checkpoints.iter().zip(&names).filter(|(_, name)| wanted(name)) {
         let completer =
             load_as(checkpoint, &options).with_context(|| format!("--checkpoint {checkpoint}"))?;
-        let asking = CompleteOptions::default().with_plan(args.plan);
+        let asking = CompleteOptions::default()
+            .with_plan(args.plan)
+            .with_readout(args.readout)
+            .with_outliers(args.outliers);
         methods.push(Method {
             name: name.clone(),
             fingerprint: settings::fingerprint(checkpoint, args.adapter.as_deref())?,

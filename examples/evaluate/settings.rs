@@ -30,6 +30,8 @@ pub struct Settings {
     /// Units per metre of integer files, if given.
     pub depth_scale: Option<f32>,
     pub plan: String,
+    pub readout: String,
+    pub outliers: String,
     /// How matrices of checkpoints are held: scores differ in their last digits.
     pub weights: String,
     /// Names of the methods, and numbers made from their files.
@@ -59,6 +61,8 @@ impl Settings {
             range: args.range,
             depth_scale: args.depth_scale.map(|s| s.units()),
             plan: args.plan.to_string(),
+            readout: args.readout.to_string(),
+            outliers: args.outliers.to_string(),
             weights: args.options()?.weights.to_string(),
             methods: methods.iter().map(|m| (m.name.clone(), m.fingerprint.clone())).collect(),
         })

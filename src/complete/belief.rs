@@ -98,7 +98,7 @@ fn answers_about(
     let queries: Vec<Query> = doubtful.iter().map(query).collect();
     // They are few: a cancellation is seen after the first batch of the plan.
     let options =
-        AskOptions { mode: options.answer.as_ref(), max_memory: options.max_memory, progress: None };
+        AskOptions { mode: options.answer.as_ref(), max_memory: options.max_memory, ..AskOptions::default() };
     ask(model, prefix, &queries, options)
 }
 

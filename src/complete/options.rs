@@ -1,7 +1,9 @@
 //! How a frame is completed.
 
-use crate::query::{AnswerMode, QueryPlan};
+use crate::error::{Error, Result};
+use crate::query::{AnswerMode, QueryPlan, Readout};
 use crate::refine::{EdgeAwareFill, Fill};
+use std::str::FromStr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -27,6 +29,29 @@ pub enum Outliers {
     /// Measurements are not checked: all of them count, and none is flagged.
     #[default]
     Trust,
+}
+
+impl FromStr for Outliers {
+    type Err = Error;
+
+    fn from_str(text: &str) -> Result<Self> {
+        match text {
+            "ignore" => Ok(Self::Ignore),
+            "preserve" => Ok(Self::Preserve),
+            "trust" => Ok(Self::Trust),
+            _ => Err(Error::argument("outliers", text, "ignore, preserve or trust")),
+        }
+    }
+}
+
+impl std::fmt::Display for Outliers {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Self::Ignore => "ignore",
+            Self::Preserve => "preserve",
+            Self::Trust => "trust",
+        })
+    }
 }
 
 /// How far a frame is.
@@ -75,6 +100,9 @@ pub struct CompleteOptions {
     pub outliers: Outliers,
     /// How answers are got; `None` for the checkpoint's own way (`answer_mode` of `sdim.json`).
     pub answer: Option<AnswerMode>,
+    /// Which number of an answer's distribution counts, where the checkpoint's numbers are bins: the median for the least mean
+    /// absolute error, the mean for the least mean squared one.
+    pub readout: Readout,
     /// Whether to ask at measured pixels too and to spread the difference over the map, so that it passes through the
     /// measurements.
     pub align: bool,
@@ -96,6 +124,7 @@ impl Default for CompleteOptions {
             preserve: Preserve::default(),
             outliers: Outliers::default(),
             answer: None,
+            readout: Readout::default(),
             align: true,
             max_memory: None,
             fill: Arc::new(EdgeAwareFill::default()),
@@ -112,6 +141,7 @@ impl std::fmt::Debug for CompleteOptions {
             .field("preserve", &self.preserve)
             .field("outliers", &self.outliers)
             .field("answer", &self.answer)
+            .field("readout", &self.readout)
             .field("align", &self.align)
             .field("max_memory", &self.max_memory)
             .finish_non_exhaustive()
@@ -134,6 +164,12 @@ impl CompleteOptions {
     /// With measurements that are not plausible left out, kept in the map or trusted.
     pub fn with_outliers(mut self, outliers: Outliers) -> Self {
         self.outliers = outliers;
+        self
+    }
+
+    /// With the median or the mean of an answer's distribution.
+    pub fn with_readout(mut self, readout: Readout) -> Self {
+        self.readout = readout;
         self
     }
 

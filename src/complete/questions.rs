@@ -82,7 +82,8 @@ impl<'a> Questions<'a> {
             !self.options.cancel.as_ref().is_some_and(CancelToken::is_cancelled)
         };
         let (mode, max_memory) = (self.options.answer.as_ref(), self.options.max_memory);
-        let options = AskOptions { mode, max_memory, progress: Some(&mut progress) };
+        let options =
+            AskOptions { mode, readout: self.options.readout, max_memory, progress: Some(&mut progress) };
         ask(self.model, self.prefix, &queries, options)
     }
 

@@ -37,8 +37,8 @@ pub(crate) use exec::read;
 pub use gemm::packed::{PackedGate, PackedWeight, RowMajor, WeightFormat};
 pub use memory::keep_freed_memory;
 pub use ops::{
-    AdamWStep, BinStats, adamw_step, add, affine_act, batch_norm_act, bin_stats, bin_stats_of_rows, conv3x3,
-    gelu_erf, linear, packed_mlp, rms_norm, rope, swiglu,
+    AdamWStep, BinStats, Middle, adamw_step, add, affine_act, batch_norm_act, bin_stats, bin_stats_of_rows,
+    conv3x3, gelu_erf, linear, packed_mlp, rms_norm, rope, swiglu,
 };
 pub use peak::peak_gflops;
 pub(crate) use threads::in_pool;

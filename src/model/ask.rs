@@ -7,12 +7,12 @@ use super::sdim_model::SdimModel;
 use crate::error::{Error, Result};
 use crate::kernels;
 use crate::query::Query;
-use crate::query::Reading;
 use crate::query::grammar::AnswerGrammar;
 use crate::query::mode::{AnswerMode, Generation};
 use crate::query::number::{DigitReader, NumberFormat};
 use crate::query::prompt::Tokens;
 use crate::query::settings::PixelReference;
+use crate::query::{Reading, Readout};
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 
@@ -30,6 +30,8 @@ const QUERY_CHUNK: usize = 8 * BATCH_ROWS;
 pub struct AskOptions<'a> {
     /// How answers are got; `None` for the checkpoint's own way.
     pub mode: Option<&'a AnswerMode>,
+    /// Which number of a distribution over bins is the answer; digits and words have but one.
+    pub readout: Readout,
     /// Bytes that a batch may take beside the weights and the prefix, about; at the least one query is asked at a time. The
     /// answers are the same for any limit.
     pub max_memory: Option<usize>,
@@ -58,7 +60,7 @@ pub fn ask(
         AnswerMode::Digits => {
             let plan = Plan { forced: true, room: 0, rows };
             in_batches(model, prefix, queries, plan, progress, Reading::INVALID, &mut |mut batch| {
-                let readings = forced_numbers(&mut batch)?.into_iter();
+                let readings = forced_numbers(&mut batch, options.readout)?.into_iter();
                 Ok(readings
                     .map(|r| Reading { value: r.value * unit, expected_error: r.expected_error * unit, ..r })
                     .collect())
@@ -181,14 +183,16 @@ fn in_batches<T: Clone + Send>(
 }
 
 /// The number that each item is made to say, in number units: its words are forced, its tokens chosen among numbers.
-fn forced_numbers(batch: &mut Batch) -> Result<Vec<Reading>> {
+fn forced_numbers(batch: &mut Batch, readout: Readout) -> Result<Vec<Reading>> {
     let numbers = batch.model.prompts.numbers();
     if let Some(bins) = numbers.format.bins() {
-        if batch.model.device.is_cpu() {
-            return batch.of_numbers(Vec::new, |scratch, row| bins.read(row, scratch));
-        }
-        let stats = batch.of_bins(|median| bins.tolerance(median))?;
-        return Ok(stats.into_iter().map(|s| s.map_or(Reading::INVALID, |s| bins.reading(s))).collect());
+        return bins.with_middle(readout, |middle| {
+            if batch.model.device.is_cpu() {
+                return batch.of_numbers(Vec::new, |scratch, row| bins.read_middle(row, scratch, middle));
+            }
+            let stats = batch.of_bins(middle, |at| bins.tolerance(at))?;
+            Ok(stats.into_iter().map(|s| s.map_or(Reading::INVALID, |s| bins.reading(s))).collect())
+        });
     }
     let NumberFormat::Digits { decimals, integers } = numbers.format else { return Ok(Vec::new()) };
     let items = batch.sequences.count();

@@ -4,7 +4,7 @@ use super::marked::MarkedFrame;
 use super::prefix::Prefix;
 use super::sdim_model::SdimModel;
 use crate::error::Result;
-use crate::kernels::{self, BinStats};
+use crate::kernels::{self, BinStats, Middle};
 use crate::query::Query;
 use crate::query::prompt::{Glimpse, Tokens};
 use crate::vlm::qwen2_5::rope::Position;
@@ -93,11 +93,15 @@ impl<'a> Batch<'a> {
     }
 
     /// Statistics of each item's distribution over the numbers as bins, found where the logits are: what comes off a device that is
-    /// not the CPU is a few values of each item. `tolerance` is that of [`kernels::bin_stats`].
-    pub(super) fn of_bins(&self, tolerance: impl Fn(f32) -> f32) -> Result<Vec<Option<BinStats>>> {
+    /// not the CPU is a few values of each item. `middle` and `tolerance` are those of [`kernels::bin_stats`].
+    pub(super) fn of_bins(
+        &self,
+        middle: Middle,
+        tolerance: impl Fn(f32) -> f32,
+    ) -> Result<Vec<Option<BinStats>>> {
         let mut out = Vec::with_capacity(self.sequences.count());
         for logits in self.number_logits() {
-            out.extend(kernels::bin_stats_of_rows(&logits?, &tolerance)?);
+            out.extend(kernels::bin_stats_of_rows(&logits?, middle, &tolerance)?);
         }
         Ok(out)
     }

@@ -1,7 +1,7 @@
 //! Where numbers lie among the bins of a vocabulary.
 
-use super::reading::{CONFIDENT_WITHIN, Reading};
-use crate::kernels::{BinStats, bin_stats};
+use super::reading::{CONFIDENT_WITHIN, Reading, Readout};
+use crate::kernels::{BinStats, Middle, bin_stats};
 
 /// The bins of a [`NumberFormat`](super::number::NumberFormat). A position counts bins from 0: bin `k` covers `k` to `k + 1`.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -73,7 +73,7 @@ impl Bins {
 
     /// The answer that a distribution over the bins gives.
     pub fn reading(&self, stats: BinStats) -> Reading {
-        let value = self.number(stats.median);
+        let value = self.number(stats.middle);
         let expected_error = match self.spacing {
             Spacing::Equal { .. } => stats.spread * self.width() as f32,
             // The spread is an expected factor.
@@ -82,10 +82,31 @@ impl Bins {
         Reading { value, confidence: stats.near, expected_error }
     }
 
-    /// Reads the logits of one answer; `scratch` is overwritten.
+    /// The number in the middle of each bin.
+    pub fn centres(&self) -> Vec<f32> {
+        (0..self.count).map(|k| self.number(k as f32 + 0.5)).collect()
+    }
+
+    /// Reads the logits of one answer as their median; `scratch` is overwritten.
     pub fn read(&self, logits: &[f32], scratch: &mut Vec<f32>) -> Reading {
-        let stats = bin_stats(logits, scratch, |median| self.tolerance(median));
+        self.read_middle(logits, scratch, Middle::Median)
+    }
+
+    /// Reads the logits of one answer; `scratch` is overwritten.
+    pub fn read_middle(&self, logits: &[f32], scratch: &mut Vec<f32>, middle: Middle) -> Reading {
+        let stats = bin_stats(logits, scratch, middle, |at| self.tolerance(at));
         stats.map_or(Reading::INVALID, |s| self.reading(s))
+    }
+
+    /// What a readout takes for the middle of a distribution, handed to `then`.
+    pub fn with_middle<T>(&self, readout: Readout, then: impl FnOnce(Middle) -> T) -> T {
+        match readout {
+            Readout::Median => then(Middle::Median),
+            Readout::Mean => {
+                let position = |number: f32| self.position(number) as f32;
+                then(Middle::Mean { values: &self.centres(), position: &position })
+            }
+        }
     }
 }
 

@@ -20,6 +20,6 @@ pub use mode::{AnswerMode, Generation};
 pub use number::{DepthUnit, NumberFormat};
 pub use plan::QueryPlan;
 pub use prompt::{FrameSpace, PromptWriter, Query};
-pub use reading::Reading;
+pub use reading::{Reading, Readout};
 pub use settings::{Hint, MeasurementPrompt, PixelReference, Settings};
 pub use template::PromptTemplate;

@@ -1,5 +1,8 @@
 //! What is read of one answer.
 
+use crate::error::{Error, Result};
+use std::str::FromStr;
+
 /// An answer in units of the frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Reading {
@@ -9,6 +12,37 @@ pub struct Reading {
     pub confidence: f32,
     /// Expected absolute error, same unit as `value`.
     pub expected_error: f32,
+}
+
+/// Which number of a distribution is the answer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Readout {
+    /// The median: the least mean absolute error, and edges that stay sharp.
+    #[default]
+    Median,
+    /// The mean: the least mean squared error. Where the model doubts between two surfaces it lies between them.
+    Mean,
+}
+
+impl FromStr for Readout {
+    type Err = Error;
+
+    fn from_str(text: &str) -> Result<Self> {
+        match text {
+            "median" => Ok(Self::Median),
+            "mean" => Ok(Self::Mean),
+            _ => Err(Error::argument("readout", text, "median or mean")),
+        }
+    }
+}
+
+impl std::fmt::Display for Readout {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Self::Median => "median",
+            Self::Mean => "mean",
+        })
+    }
 }
 
 impl Reading {

@@ -9,17 +9,36 @@ const BLOCK_BINS: usize = 64;
 /// What [`bin_stats`] finds, in bins: bin `k` covers `k` to `k + 1`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct BinStats {
-    /// Median, linear within its bin.
-    pub median: f32,
-    /// Expected distance of a bin's centre from the median.
+    /// Where the middle of the distribution lies.
+    pub middle: f32,
+    /// Expected distance of a bin's centre from the middle.
     pub spread: f32,
     /// Probability of the bins whose centre is within the tolerance.
     pub near: f32,
 }
 
-/// Statistics of `softmax(logits)`. `tolerance` gives the distance from the median, in bins, within which
+/// What counts as the middle of a distribution.
+#[derive(Clone, Copy)]
+pub enum Middle<'a> {
+    /// Its median, linear within its bin.
+    Median,
+    /// The mean of what the bins stand for.
+    Mean {
+        /// What each bin stands for.
+        values: &'a [f32],
+        /// Where among the bins such a value lies.
+        position: &'a (dyn Fn(f32) -> f32 + Sync),
+    },
+}
+
+/// Statistics of `softmax(logits)`. `tolerance` gives the distance from the middle, in bins, within which
 /// [`BinStats::near`] counts; `scratch` is overwritten. `None` if a logit is NaN or the largest is not finite.
-pub fn bin_stats(logits: &[f32], scratch: &mut Vec<f32>, tolerance: impl Fn(f32) -> f32) -> Option<BinStats> {
+pub fn bin_stats(
+    logits: &[f32],
+    scratch: &mut Vec<f32>,
+    middle: Middle,
+    tolerance: impl Fn(f32) -> f32,
+) -> Option<BinStats> {
     let level = Level::current();
     let blocks = logits.len().div_ceil(BLOCK_BINS);
     scratch.clear();
@@ -30,9 +49,14 @@ pub fn bin_stats(logits: &[f32], scratch: &mut Vec<f32>, tolerance: impl Fn(f32)
     if !max.is_finite() || total.is_nan() {
         return None;
     }
-    let median = median(weights, sums, total * 0.5);
-    let (off, near) = distances(level, weights, median, tolerance(median));
-    Some(BinStats { median, spread: off / total, near: (near / total).clamp(0.0, 1.0) })
+    let middle = match middle {
+        Middle::Median => median(weights, sums, total * 0.5),
+        Middle::Mean { values, position } => {
+            position(weights.iter().zip(values).map(|(w, v)| w * v).sum::<f32>() / total)
+        }
+    };
+    let (off, near) = distances(level, weights, middle, tolerance(middle));
+    Some(BinStats { middle, spread: off / total, near: (near / total).clamp(0.0, 1.0) })
 }
 
 /// Where the sum of the weights reaches `half`.
@@ -127,12 +151,27 @@ mod tests {
             let logits: Vec<f32> = (0..n).map(|i| ((i * 7919 % 1013) as f32 / 1013.0) * sharp).collect();
             let (median, spread, near) = plain(&logits, 7.25);
             at_every_level(|| {
-                let s = bin_stats(&logits, &mut Vec::new(), |_| 7.25).unwrap();
+                let s = bin_stats(&logits, &mut Vec::new(), Middle::Median, |_| 7.25).unwrap();
                 let off = |a: f32, b: f64| (f64::from(a) - b).abs() / b.max(1.0);
-                assert!(off(s.median, median) < 1e-4 && off(s.spread, spread) < 1e-4, "{n}: {s:?}");
+                assert!(off(s.middle, median) < 1e-4 && off(s.spread, spread) < 1e-4, "{n}: {s:?}");
                 assert!(off(s.near, near) < 1e-4, "{n}: {s:?}, {near}");
             });
         }
+    }
+
+    #[test]
+    fn a_mean_is_that_of_what_the_bins_stand_for() {
+        let values: Vec<f32> = (0..100).map(|k| (k as f32 * 0.05).exp()).collect();
+        let position = |v: f32| v.ln() / 0.05 + 0.5;
+        let mut logits = vec![-60f32; 100];
+        (logits[10], logits[90]) = (0.0, 0.0);
+        let middle = Middle::Mean { values: &values, position: &position };
+        at_every_level(|| {
+            let s = bin_stats(&logits, &mut Vec::new(), middle, |_| 40.0).unwrap();
+            let mean = position((values[10] + values[90]) / 2.0);
+            assert!((s.middle - mean).abs() < 1e-3 && (s.spread - 40.0).abs() < 1e-3, "{s:?}, {mean}");
+            assert!((s.near - 0.5).abs() < 1e-5, "the upper one is nearer: {s:?}");
+        });
     }
 
     #[test]
@@ -141,9 +180,9 @@ mod tests {
         for bad in [f32::NAN, f32::INFINITY] {
             let mut logits = vec![0.5f32; 40];
             logits[33] = bad;
-            at_every_level(|| assert_eq!(bin_stats(&logits, &mut Vec::new(), |_| 1.0), None));
+            at_every_level(|| assert_eq!(bin_stats(&logits, &mut Vec::new(), Middle::Median, |_| 1.0), None));
         }
-        assert_eq!(bin_stats(&[f32::NEG_INFINITY; 3], &mut scratch, |_| 1.0), None);
-        assert_eq!(bin_stats(&[], &mut scratch, |_| 1.0), None);
+        assert_eq!(bin_stats(&[f32::NEG_INFINITY; 3], &mut scratch, Middle::Median, |_| 1.0), None);
+        assert_eq!(bin_stats(&[], &mut scratch, Middle::Median, |_| 1.0), None);
     }
 }

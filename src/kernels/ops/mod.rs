@@ -16,7 +16,7 @@ pub use activation::{gelu_erf, swiglu};
 pub use adamw::{AdamWStep, adamw_step};
 pub use add::add;
 pub use bin_rows::bin_stats_of_rows;
-pub use bins::{BinStats, bin_stats};
+pub use bins::{BinStats, Middle, bin_stats};
 pub use conv::conv3x3;
 pub use linear::linear;
 pub use mlp::packed_mlp;
