@@ -191,61 +191,10 @@ impl Stage {
         let built = self.real(0.2, 1.0);
         for s in [-1.0f32, 1.0] {
             self.cuboid(&world, [s * (curb + 30.0), 0.0, 60.0], [30.0, 0.12, 200.0], pavement);
-            let mut z = self.real(-15.0, 5.0);
-            while z < 110.0 {
-                let long = self.log(3.0, 14.0);
-                let high = self.log(2.0, 12.0);
-                if self.chance(built) {
-                    let deep = self.real(4.0, 8.0);
-                    let x = s * (curb + walk + deep + self.log(0.01, 3.0));
-                    self.building(&Place::new([x, 0.1, z + long], 0.0), [deep, high, long]);
-                } else if self.chance(0.5) {
-                    let hedge = [self.real(0.05, 0.2), self.real(0.2, 0.4), 0.06];
-                    let m = self.paint(Pattern::Leaves, mul(hedge, 0.4), hedge, 0.4);
-                    let tall = self.real(0.4, 1.5);
-                    self.cuboid(&world, [s * (curb + walk), tall, z + long], [0.5, tall, long], m);
-                }
-                z += 2.0 * long + if self.chance(0.3) { self.real(1.0, 12.0) } else { 0.0 };
-            }
-            let mut z = self.real(2.0, 12.0);
-            let trees = self.real(0.0, 0.8);
-            let row = self.real(5.0, 14.0);
-            while z < 90.0 {
-                let x = s * (curb + self.real(0.4, 1.2));
-                let place = Place::new([x, 0.1, z], FRAC_PI_2 - FRAC_PI_2 * s);
-                if self.chance(trees) {
-                    let tall = self.real(3.0, 11.0);
-                    self.tree(&place, tall);
-                } else if self.chance(0.6) {
-                    self.pole(&place);
-                } else if self.chance(0.4) {
-                    self.person(&place);
-                }
-                z += row * self.real(0.7, 1.4);
-            }
-            let parked = self.real(0.0, 0.8);
-            let mut z = self.real(3.0, 9.0);
-            while z < 70.0 {
-                if self.chance(parked) {
-                    let turn = self.real(-0.05, 0.05);
-                    self.car(&Place::new([s * (curb - 1.1), 0.0, z], turn));
-                }
-                z += self.real(5.2, 9.0);
-            }
+            self.frontage(s, curb + walk, built);
+            self.kerbside(s, curb);
         }
-        for _ in 0..self.int(0, 5) {
-            let lanes = (curb / lane) as i32;
-            let x = lane
-                * (self.int(0, (2 * lanes).max(1) as usize) as f32 - lanes as f32 + 0.5)
-                    .clamp(-curb / lane + 0.6, curb / lane - 0.6);
-            let turn = if x < 0.0 { PI } else { 0.0 };
-            let z = self.log(7.0, 80.0);
-            if self.chance(0.75) {
-                self.car(&Place::new([x, 0.0, z], turn));
-            } else {
-                self.truck(&Place::new([x, 0.0, z], turn));
-            }
-        }
+        self.vehicles(curb, lane);
         if self.chance(0.6) {
             let half = [self.real(10.0, 50.0), self.log(3.0, 20.0), 5.0];
             let at = [self.real(-20.0, 20.0), 0.0, self.real(90.0, 130.0)];
@@ -259,6 +208,73 @@ impl Stage {
         let target = [at[0] + self.real(-3.0, 3.0), height + self.real(-4.0, 1.5), 30.0];
         self.aim(k, at, target, if at[1] > 2.4 { 0.4 } else { 0.15 });
         self.focus = ([at[0], 0.0, 18.0], 22.0);
+    }
+
+    /// Houses and hedges along one side, `s` -1 or 1, from `edge` metres off the middle on.
+    fn frontage(&mut self, s: f32, edge: f32, built: f32) {
+        let world = self.world();
+        let mut z = self.real(-15.0, 5.0);
+        while z < 110.0 {
+            let long = self.log(3.0, 14.0);
+            let high = self.log(2.0, 12.0);
+            if self.chance(built) {
+                let deep = self.real(4.0, 8.0);
+                let x = s * (edge + deep + self.log(0.01, 3.0));
+                self.building(&Place::new([x, 0.1, z + long], 0.0), [deep, high, long]);
+            } else if self.chance(0.5) {
+                let hedge = [self.real(0.05, 0.2), self.real(0.2, 0.4), 0.06];
+                let m = self.paint(Pattern::Leaves, mul(hedge, 0.4), hedge, 0.4);
+                let tall = self.real(0.4, 1.5);
+                self.cuboid(&world, [s * edge, tall, z + long], [0.5, tall, long], m);
+            }
+            z += 2.0 * long + if self.chance(0.3) { self.real(1.0, 12.0) } else { 0.0 };
+        }
+    }
+
+    /// Trees, poles and people beside the road, and parked cars.
+    fn kerbside(&mut self, s: f32, curb: f32) {
+        let mut z = self.real(2.0, 12.0);
+        let trees = self.real(0.0, 0.8);
+        let row = self.real(5.0, 14.0);
+        while z < 90.0 {
+            let x = s * (curb + self.real(0.4, 1.2));
+            let place = Place::new([x, 0.1, z], FRAC_PI_2 - FRAC_PI_2 * s);
+            if self.chance(trees) {
+                let tall = self.real(3.0, 11.0);
+                self.tree(&place, tall);
+            } else if self.chance(0.6) {
+                self.pole(&place);
+            } else if self.chance(0.4) {
+                self.person(&place);
+            }
+            z += row * self.real(0.7, 1.4);
+        }
+        let parked = self.real(0.0, 0.8);
+        let mut z = self.real(3.0, 9.0);
+        while z < 70.0 {
+            if self.chance(parked) {
+                let turn = self.real(-0.05, 0.05);
+                self.car(&Place::new([s * (curb - 1.1), 0.0, z], turn));
+            }
+            z += self.real(5.2, 9.0);
+        }
+    }
+
+    /// What drives on the road.
+    fn vehicles(&mut self, curb: f32, lane: f32) {
+        for _ in 0..self.int(0, 5) {
+            let lanes = (curb / lane) as i32;
+            let x = lane
+                * (self.int(0, (2 * lanes).max(1) as usize) as f32 - lanes as f32 + 0.5)
+                    .clamp(-curb / lane + 0.6, curb / lane - 0.6);
+            let turn = if x < 0.0 { PI } else { 0.0 };
+            let z = self.log(7.0, 80.0);
+            if self.chance(0.75) {
+                self.car(&Place::new([x, 0.0, z], turn));
+            } else {
+                self.truck(&Place::new([x, 0.0, z], turn));
+            }
+        }
     }
 
     pub(super) fn hills(&mut self) {
