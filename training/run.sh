@@ -26,15 +26,15 @@ pack() {
     rm -rf "$stage"
     mkdir -p "$stage/bin" "$stage/extra"
     cd "$root"
-    export RUSTFLAGS="${RUSTFLAGS:-} -C target-cpu=${TARGET_CPU:-x86-64-v3}"
     if [ -d "$(rustc --print sysroot)/lib/rustlib/$musl" ]; then
         host=$musl
     elif [ -n "$(find /usr/lib /usr/lib64 -name libc.a -print -quit 2>/dev/null)" ]; then
         # No musl here, but a static C library of the GNU kind will do.
-        RUSTFLAGS="$RUSTFLAGS -C target-feature=+crt-static"
+        RUSTFLAGS="${RUSTFLAGS:-} -C target-feature=+crt-static"
     else
         echo "NOTE: a program that needs this machine's C library or a newer one: $(ldd --version | head -n 1)"
     fi
+    export RUSTFLAGS="${RUSTFLAGS:-} -C target-cpu=${TARGET_CPU:-x86-64-v3}"
     local built=${CARGO_TARGET_DIR:-target}/$host/release/examples examples=(--example records)
     [ -z "${FURNITURE:-}" ] || examples+=(--example furniture)
     cargo build --release "${examples[@]}" --target "$host"
