@@ -15,6 +15,7 @@ use sdim::internals::supervise::{
 };
 use sdim::internals::vlm::qwen2_5::decoder::Keep;
 use sdim::internals::vlm::qwen2_5::sequences::Sequences;
+use sdim::scenes::furnished::Library;
 use sdim::settings::{Hint, Settings};
 use sdim::{Error, LoadOptions, Result, WeightFormat};
 use std::path::{Path, PathBuf};
@@ -196,6 +197,99 @@ fn held_out_scenes_are_the_same_for_any_number_of_points_and_never_trained_on() 
     );
 }
 
+/// A folder of boxes that are called furniture.
+fn boxes(dir: &Path) -> Library {
+    let corner = |i: usize| format!("v {} {} {}\n", i & 1, i >> 1 & 1, i >> 2);
+    let faces = "f 1 2 4 3\nf 5 6 8 7\nf 1 2 6 5\nf 3 4 8 7\nf 1 3 7 5\nf 2 4 8 6\n";
+    std::fs::write(dir.join("box.obj"), (0..8).map(corner).collect::<String>() + faces).unwrap();
+    let mut catalogue = String::new();
+    let names = ["Chair", "Table", "Bookcase", "Sofa", "Bed", "Desk"];
+    for (i, name) in (1..=60).zip(names.into_iter().cycle()) {
+        catalogue += &format!(
+            "id#{i}=box{i}\nname#{i}={name}\ncategory#{i}=Living room\nmodel#{i}=/box.obj\n\
+             width#{i}=60\ndepth#{i}=50\nheight#{i}=80\nlicense#{i}=CC0\ncreator#{i}=A\n"
+        );
+    }
+    std::fs::write(dir.join("PluginFurnitureCatalog.properties"), catalogue).unwrap();
+    Library::open(dir).unwrap()
+}
+
+#[test]
+fn a_mix_is_the_same_on_any_number_of_threads_and_keeps_its_parts_apart() {
+    let (writer, dir) = (Writer::new(|_| {}), tempfile::tempdir().unwrap());
+    let library = boxes(dir.path());
+    let mix: SceneMix = "procedural=1,furnished=1,streets=1".parse().unwrap();
+    let mut train = config();
+    (train.batch.mix, train.batch.frames, train.batch.sizes) = (mix, 8, vec![(48, 32)]);
+    let set = RecordSet::HeldOut { points: 20, grid: None };
+    let held = RecordConfig { set, variants: 1, ..train.clone() };
+    let scenes = |held_out| Scenes::new(mix).with_library(&library, held_out).unwrap();
+    for (config, held_out) in [(&train, false), (&held, true)] {
+        let [one, two] = [1, 2].map(|threads| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| config.shard(writer.asking(), &scenes(held_out), 1)).unwrap()
+        });
+        assert_eq!(one, two);
+        // What each recipe alone makes of the seeds.
+        let kinds: Vec<_> =
+            one.seed.iter().map(|&s| frame(&scenes(held_out), s, (48, 32)).unwrap()).collect();
+        let alone = |name: &str| {
+            let scenes = Scenes::new(format!("{name}=1").parse().unwrap());
+            let scenes = scenes.with_library(&library, held_out).unwrap();
+            let same = |(i, &s): (usize, &u64)| frame(&scenes, s, (48, 32)).unwrap().rgb == kinds[i].rgb;
+            one.seed.iter().enumerate().filter(|&f| same(f)).count()
+        };
+        let counts = ["procedural", "furnished", "streets"].map(alone);
+        assert!(counts.iter().sum::<usize>() == 8 && counts.iter().all(|&n| n > 0), "{counts:?}");
+        // The other part's models are refused, and so is another mix.
+        for wrong in [scenes(!held_out), Scenes::new(mix), plain()] {
+            let found = config.shard(writer.asking(), &wrong, 1);
+            let name = if wrong.mix() == mix { "library" } else { "mix" };
+            assert!(matches!(found, Err(Error::Argument { name: found, .. }) if found == name), "{name}");
+        }
+    }
+    let ids = |held_out| {
+        let part = if held_out {
+            sdim::scenes::furnished::Split::HeldOut
+        } else {
+            sdim::scenes::furnished::Split::Train
+        };
+        library.part(part).unwrap().models().into_iter().map(|m| m.id).collect::<Vec<_>>()
+    };
+    let (trained, held) = (ids(false), ids(true));
+    assert!(
+        held.len() > 3 && trained.len() + held.len() == 60 && trained.iter().all(|id| !held.contains(id))
+    );
+}
+
+#[test]
+fn variants_share_the_picture_and_bad_measurements_are_told_but_not_asked() {
+    let writer = Writer::new(|_| {});
+    let mut config = config();
+    (config.variants, config.batch.sensors, config.batch.errors) = (4, 1.0, 1.0);
+    let shard = config.shard(writer.asking(), &plain(), 0).unwrap();
+    let size = (shard.dims.width, shard.dims.height);
+    let mut wrong = 0;
+    for (i, &seed) in shard.seed.iter().enumerate() {
+        let clean = frame(&plain(), seed, size).unwrap();
+        for v in i * 4..(i + 1) * 4 {
+            let truth = |x: usize, y: usize| clean.depth[y * size.0 + x] / shard.unit[v];
+            for q in v * 9..(v + 1) * 9 {
+                let expected = truth(shard.asked_x[q].into(), shard.asked_y[q].into());
+                assert!((shard.asked_value[q] / expected - 1.0).abs() < 1e-5);
+            }
+            let told = shard.measured_start[v] as usize..shard.measured_start[v + 1] as usize;
+            let off = told.filter(|&m| {
+                let pixel = shard.measured_pixel[m] as usize;
+                let ratio = shard.measured_value[m] / truth(pixel % size.0, pixel / size.0);
+                !(0.78..1.28).contains(&ratio)
+            });
+            wrong += usize::from(off.count() > 0);
+        }
+    }
+    assert!(wrong >= 9, "{wrong} of 12 sets of measurements have bad ones");
+}
+
 #[test]
 fn what_records_cannot_hold_is_refused() {
     let writer = Writer::new(|_| {});
@@ -279,6 +373,12 @@ fn the_program_goes_on_where_it_was_and_keeps_sets_apart() {
     assert_ne!(std::fs::read(dir.path().join("set/000001.safetensors")).unwrap(), bytes);
     let (ok, said) = run(&["--count", "6", "--seconds", "0"]);
     assert!(ok && said.contains("--seconds is over") && said.contains("0 new frames"), "{said}");
+    let (ok, said) = run(&["--count", "6", "--mix", "rooms=1"]);
+    assert!(!ok && said.contains("rooms=1") && said.contains("procedural, furnished, streets"), "{said}");
+    let (ok, said) = run(&["--count", "6", "--mix", "furnished=1"]);
+    assert!(!ok && said.contains("a folder of models"), "{said}");
+    let (ok, said) = run(&["--count", "6", "--mix", "streets=1"]);
+    assert!(!ok && said.contains("other records are there"), "{said}");
     let (ok, said) = run(&["--count", "6", "--seed", "8"]);
     assert!(!ok && said.contains("other records are there"), "{said}");
 }

@@ -26,15 +26,15 @@ pack() {
     rm -rf "$stage"
     mkdir -p "$stage/bin" "$stage/extra"
     cd "$root"
-    export RUSTFLAGS="${RUSTFLAGS:-} -C target-cpu=${TARGET_CPU:-x86-64-v3}"
     if [ -d "$(rustc --print sysroot)/lib/rustlib/$musl" ]; then
         host=$musl
     elif [ -n "$(find /usr/lib /usr/lib64 -name libc.a -print -quit 2>/dev/null)" ]; then
         # No musl here, but a static C library of the GNU kind will do.
-        RUSTFLAGS="$RUSTFLAGS -C target-feature=+crt-static"
+        RUSTFLAGS="${RUSTFLAGS:-} -C target-feature=+crt-static"
     else
         echo "NOTE: a program that needs this machine's C library or a newer one: $(ldd --version | head -n 1)"
     fi
+    export RUSTFLAGS="${RUSTFLAGS:-} -C target-cpu=${TARGET_CPU:-x86-64-v3}"
     local built=${CARGO_TARGET_DIR:-target}/$host/release/examples examples=(--example records)
     [ -z "${FURNITURE:-}" ] || examples+=(--example furniture)
     cargo build --release "${examples[@]}" --target "$host"
@@ -102,7 +102,8 @@ train() {
         --init "${!init:-$work/fresh/$name}" --out "$work/out/$name" --held-out "$work"/held/* --pictures "$work/pictures" \
         --follow --wait-frames "${WAIT_FRAMES:-1024}" --batch "${BATCH:-64}" --rate "${RATE:-1.5e-3}" \
         --seed "${SEED:-7}" --until $((end - 18)) ${TRAIN_ARGS:-} ${!own:-} 2>&1 | tee "$work/logs/log-$name.txt"
-    [ "${PIPESTATUS[0]}" -eq 0 ] || echo "the trainer of $name ended with ${PIPESTATUS[0]}"
+    local status=${PIPESTATUS[0]}
+    [ "$status" -eq 0 ] || echo "the trainer of $name ended with $status"
 }
 
 run() {
@@ -134,8 +135,8 @@ run() {
     read -r -a models <<<"$shapes"
     echo "$(nproc) cores, $gpus GPUs, $("$python" -c 'import torch; print("PyTorch", torch.__version__)'), $work: $(df -h --output=avail "$work" | tail -n 1) free"
 
-    common=(--size "${SIZE:-384x288}" --prompt "${PROMPT:-512}" --questions "${QUESTIONS:-128}" --points "${POINTS:-40,1500}"
-        --shard "${SHARD:-64}" --seed "${SEED:-7}" --threads "${THREADS:-$(nproc)}")
+    common=(--size "${SIZE:-384x288}" --prompt "${PROMPT:-512}" --points "${POINTS:-40,1500}"
+        --seed "${SEED:-7}" --threads "${THREADS:-$(nproc)}")
     local settings=()
     for shape in "${models[@]}"; do
         records --shape "$shape" ${settings[@]+"${settings[@]}"} --fresh "$work/fresh/$(named "$shape")"
@@ -145,7 +146,7 @@ run() {
     common+=(--shape "${models[0]}" "${settings[@]}")
     # The renderer makes way for the held-out sets and for the trainers' threads.
     nice -n 10 "$pack/bin/records" "${common[@]}" ${extra[@]+"${extra[@]}"} --mix "$mix" --out "$work/train" \
-        --count 100000000 --variants "${VARIANTS:-4}" --max-gb "${MAX_GB:-30}" --seconds $((end - $(date +%s) - 20)) &
+        --count 100000000 --shard "${SHARD:-64}" --questions "${QUESTIONS:-128}" --variants "${VARIANTS:-4}" --max-gb "${MAX_GB:-30}" --seconds $((end - $(date +%s) - 20)) &
     renderer=$!
     held_out
     echo "$(($(date +%s) - begin)) s until training starts"
@@ -177,6 +178,7 @@ pieces() {
 
 # Whatever happened, what is there goes to OUT: seven pieces of checkpoints at most, and one file of all else.
 collect() {
+    [ "$BASHPID" = "$$" ] || return 0
     trap - EXIT
     set +e
     [ -z "$renderer" ] || kill "$renderer" 2>/dev/null
