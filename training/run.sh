@@ -133,7 +133,7 @@ run() {
     fi
     mix=${MIX:-$mix} held_mix=${HELD_MIX:-$held_mix}
     read -r -a models <<<"$shapes"
-    echo "$(nproc) cores, $gpus GPUs, $("$python" -c 'import torch; print("PyTorch", torch.__version__)'), $work: $(df -h --output=avail "$work" | tail -n 1) free"
+    echo "$(nproc) cores, $gpus GPUs, PyTorch $("$python" -c 'import importlib.metadata as m; print(m.version("torch"))'), $work: $(df -h --output=avail "$work" | tail -n 1) free"
 
     common=(--size "${SIZE:-384x288}" --prompt "${PROMPT:-512}" --points "${POINTS:-40,1500}"
         --seed "${SEED:-7}" --threads "${THREADS:-$(nproc)}")

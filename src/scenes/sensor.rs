@@ -158,9 +158,8 @@ impl DepthSensor {
         let median = *seen.select_nth_unstable_by(middle, f32::total_cmp).1;
         let largest = seen.iter().copied().fold(median, f32::max);
         let mut out = vec![f32::NAN; depth.len()];
-        let bounds = (self.edge_holes > 0.0 || self.mixed > 0.0)
-            .then(|| surroundings(depth, width))
-            .unwrap_or_default();
+        let edges_count = self.edge_holes > 0.0 || self.mixed > 0.0;
+        let bounds = if edges_count { surroundings(depth, width) } else { Vec::new() };
         for y in 0..height {
             for x in 0..width {
                 let shifted = |v: usize, by: i32, size: usize| {

@@ -138,8 +138,8 @@ impl Frame<'_> {
             let Some(p) = &points[i] else { return Share::default() };
             let (x, y) = (i % w, i / w);
             let mut sum = Sum::default();
-            for by in ((y + 1) / 2).saturating_sub(2)..((y + 1) / 2 + 2).min(rows) {
-                for bx in ((x + 1) / 2).saturating_sub(2)..((x + 1) / 2 + 2).min(columns) {
+            for by in y.div_ceil(2).saturating_sub(2)..(y.div_ceil(2) + 2).min(rows) {
+                for bx in x.div_ceil(2).saturating_sub(2)..(x.div_ceil(2) + 2).min(columns) {
                     if let Some((q, share)) = &gathered[by * columns + bx]
                         && p.continues(q)
                     {
