@@ -87,7 +87,7 @@ impl Model {
 
 #[test]
 fn answers_are_equal_in_ten_runs_on_other_threads_and_almost_those_of_f32() {
-    let queries = if device().is_cpu() { 64 } else { 2048 };
+    let queries = if device().is_cpu() { 32 } else { 2048 };
     let model = Model::new(WeightFormat::Bf16);
     let wanted = model.answers(queries);
     let mut kinds = wanted.clone();
@@ -127,7 +127,8 @@ fn another() -> Device {
 #[test]
 fn completers_of_several_threads_give_the_maps_of_one() {
     let (rgb, sparse) = frame();
-    let options = CompleteOptions::default().with_plan(QueryPlan::Stride(2));
+    let (stride, repeats) = if device().is_cpu() { (16, 1) } else { (2, 4) };
+    let options = CompleteOptions::default().with_plan(QueryPlan::Stride(stride));
     for format in [WeightFormat::F32, WeightFormat::Bf16] {
         let completer = |device: &Device| {
             let mut load = LoadOptions::on(device);
@@ -139,7 +140,8 @@ fn completers_of_several_threads_give_the_maps_of_one() {
         let others = [one.clone(), one, completer(&device()), completer(&another()), completer(&another())];
         std::thread::scope(|scope| {
             let runs = others.iter().map(|c| {
-                let run = || (0..4).map(|_| c.complete(&rgb, &sparse, &options).unwrap()).collect::<Vec<_>>();
+                let run =
+                    || (0..repeats).map(|_| c.complete(&rgb, &sparse, &options).unwrap()).collect::<Vec<_>>();
                 scope.spawn(run)
             });
             for (i, run) in runs.collect::<Vec<_>>().into_iter().enumerate() {

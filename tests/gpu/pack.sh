@@ -41,5 +41,5 @@ cp -r assets/example "$stage/assets/"
 cp -r tests/fixtures/qwen_small tests/fixtures/family "$stage/tests/fixtures/"
 cp "$here/libraries.py" "$here/report.py" "$stage/"
 # The programs have most of their bytes in common: the dictionary holds all of them.
-tar -C "$stage" -cf - . | xz -T1 --lzma2=preset=6,dict=384MiB >"$here/out/payload.tar.xz"
+tar -C "$stage" -cf - . | xz -T1 --lzma2=preset=1,dict=384MiB >"$here/out/payload.tar.xz"
 ls -l "$here/out/payload.tar.xz"

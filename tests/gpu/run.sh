@@ -48,7 +48,9 @@ check() {
     [ $code != 124 ] || ended="STOPPED after $limit s"
     note "$(printf '%-22s %-22s %6.1f s' "$name" "$ended" "$(((($(date +%s%N) - began)) / 1000000))e-3")"
     if [ $code != 0 ]; then
-        grep -ahE 'panicked|rror|differ|assert|FAILED|fails' "$log" "$log.err" | cut -c1-220 | awk '!seen[$0]++' | head -n 6 | sed 's/^/    /' >>"$table"
+        # Of tests, what each said where it panicked; else what looks like an error.
+        { grep -ahA3 'panicked at' "$log.err" || grep -ahE 'rror|not found|round' "$log" "$log.err"; } |
+            grep -vE '^--$|stack backtrace|RUST_BACKTRACE' | cut -c1-200 | awk '!seen[$0]++' | head -n 14 | sed 's/^/    /' >>"$table"
     fi
     return $code
 }
@@ -58,32 +60,36 @@ tests() {
     local name=$1 limit=$2 program=$3
     shift 3
     check "$name" "$limit" env SDIM_TEST_DEVICE=cuda:0 "$work/bin/test-$program" --nocapture "$@"
-    grep -ahE '^test result' "$out/logs/$name.log" | cut -c1-120 | sed 's/^/    /' >>"$table"
+    # With what a passing golden test says of its margins.
+    grep -ahE '^test result|tensors agree|first ids' "$out/logs/$name.log" 2>/dev/null | cut -c1-170 | sed 's/^/    /' >>"$table"
 }
 
 frame() {
     local name=$1 limit=$2
     shift 2
     check "$name" "$limit" "$work/bin/complete" --rgb "$work/assets/example/rgb.png" --sparse "$work/assets/example/sparse.png" \
-        --gt "$work/assets/example/gt.png" --depth-scale mm --json --out "$out/maps/$name" "$@"
+        --gt "$work/assets/example/gt.png" --depth-scale mm --json --out "$out/maps/$name" "$@" || return 0
     python3 "$work/report.py" frame "$out/logs/$name.log" >>"$table"
 }
 
 model() {
     local name=$1 limit=$2
     shift 2
-    check "$name" "$limit" "$work/bin/throughput" --device cuda:0 --json "$@"
+    check "$name" "$limit" "$work/bin/throughput" --device cuda:0 --json "$@" || return 0
     python3 "$work/report.py" model "$out/logs/$name.log" >>"$table"
 }
 
-compare() { note "$(printf '    %s against %s: %s' "$2" "$1" "$(python3 "$work/report.py" maps "$out/maps/$1/dense.npy" "$out/maps/$2/dense.npy" 2>&1 | tail -n 1)")"; }
+compare() {
+    [ -e "$out/maps/$1/dense.npy" ] && [ -e "$out/maps/$2/dense.npy" ] || return 0
+    note "$(printf '    %s against %s: %s' "$2" "$1" "$(python3 "$work/report.py" maps "$out/maps/$1/dense.npy" "$out/maps/$2/dense.npy" 2>&1 | tail -n 1)")"
+}
 
 {
-    nvidia-smi --query-gpu=name,driver_version,memory.total,memory.used --format=csv,noheader
+    nvidia-smi --query-gpu=name,driver_version,memory.total,memory.used --format=csv,noheader || echo "no nvidia-smi"
     nproc
     ldd "$work/bin/complete" | grep -E 'libcu|not found'
 } >"$out/logs/machine.log" 2>&1
-note "$(head -n 1 "$out/logs/machine.log"), $(nproc) CPU cores"
+note "$(grep -v 'command not found' "$out/logs/machine.log" | head -n 1), $(nproc) CPU cores"
 grep 'not found' "$out/logs/machine.log" | sed 's/^/    /' >>"$table"
 
 # One run after the other pays for the kernels that it is the first to use.

@@ -16,7 +16,38 @@ pub(super) fn batched(
     shared: Option<(&Tensor, &Tensor)>,
     layout: &AttentionLayout,
 ) -> Result<Tensor> {
+    if let Some((order, layout)) = sorted_by_size(layout, q.dim(0)?) {
+        let mut places = vec![0u32; order.len()];
+        order.iter().zip(0..).for_each(|(&row, place)| places[row as usize] = place);
+        let pick = |t: &Tensor, rows: &[u32]| t.index_select(&Tensor::new(rows, q.device())?, 0);
+        let [q, k, v] = [pick(q, &order)?, pick(k, &order)?, pick(v, &order)?];
+        let sorted = in_pieces(&q, [&k, &v], [&k, &v], &layout, MAX_SCORES)?;
+        return Ok(pick(&sorted, &places)?);
+    }
     in_pieces(q, [k, v], shared.unwrap_or((k, v)).into(), layout, MAX_SCORES)
+}
+
+/// Where all of so many rows are in blocks that see themselves alone, and sizes alternate, as windows at the border of a picture do: the rows
+/// in an order in which blocks of one size follow each other, and the layout of that order.
+fn sorted_by_size(layout: &AttentionLayout, rows: usize) -> Option<(Vec<u32>, AttentionLayout)> {
+    let alone = |b: &Block| b.shared.is_empty() && b.own_start == b.queries.start && b.q_period == b.k_period;
+    let mut blocks: Vec<&Block> = layout.blocks.iter().filter(|b| !b.queries.is_empty()).collect();
+    if !blocks.iter().all(|b| alone(b)) || blocks.iter().map(|b| b.queries.len()).sum::<usize>() != rows {
+        return None;
+    }
+    blocks.sort_by_key(|b| (b.q_period, b.causal, b.queries.start));
+    let kinds = 1 + blocks.windows(2).filter(|w| w[0].q_period != w[1].q_period).count();
+    if joined(&layout.blocks).len() <= kinds + 1 {
+        return None;
+    }
+    let mut order = Vec::with_capacity(rows);
+    let moved = blocks.iter().map(|b| {
+        let start = order.len();
+        order.extend(b.queries.clone().map(|row| row as u32));
+        Block { queries: start..order.len(), own_start: start, ..(*b).clone() }
+    });
+    let blocks = moved.collect();
+    Some((order, AttentionLayout { blocks, ..layout.clone() }))
 }
 
 fn in_pieces(
@@ -196,16 +227,11 @@ mod tests {
     fn cases() -> Vec<(AttentionLayout, bool)> {
         let prefix = |b: Block, shared| Block { shared, ..b };
         let windows = [0..16, 16..32, 32..40, 40..48, 48..50];
+        let bordered = [0..8, 8..16, 16..20, 20..28, 28..36, 36..40, 40..44, 44..48, 48..50];
+        let alone = |w: &std::ops::Range<usize>| block(w.clone(), w.start, (w.len(), w.len()), false);
         vec![
-            (
-                layout(
-                    windows
-                        .into_iter()
-                        .map(|w| block(w.clone(), w.start, (w.len(), w.len()), false))
-                        .collect(),
-                ),
-                false,
-            ),
+            (layout(bordered.iter().map(alone).collect()), false),
+            (layout(windows.iter().map(alone).collect()), false),
             (layout(vec![block(3..33, 0, (30, 30), true)]), false),
             (layout(vec![prefix(block(0..36, 0, (3, 5), true), 2..9)]), true),
             (layout(vec![prefix(block(0..40, 0, (1, 1), true), 0..20)]), true),
@@ -237,6 +263,12 @@ mod tests {
             windows.into_iter().map(|w| block(w.clone(), w.start, (w.len(), w.len()), false)).collect();
         let found: Vec<_> = joined(&blocks).iter().map(|b| (b.queries.clone(), b.q_period)).collect();
         assert_eq!(found, [(0..32, 16), (32..48, 8), (48..50, 2)]);
+        let bordered =
+            [8..12, 0..8, 12..20, 20..24].map(|w| block(w.clone(), w.start, (w.len(), w.len()), false));
+        let (order, sorted) = sorted_by_size(&layout(bordered.to_vec()), 24).unwrap();
+        assert_eq!(order, (8..12).chain(20..24).chain(0..8).chain(12..20).collect::<Vec<u32>>());
+        assert_eq!(joined(&sorted.blocks).len(), 2);
+        assert!(sorted_by_size(&layout(bordered.to_vec()), 25).is_none(), "a row of no block");
         // Keys that do not go on, and another prefix.
         assert_eq!(joined(&[block(0..4, 0, (4, 4), true), block(4..8, 5, (4, 4), true)]).len(), 2);
         let other = Block { shared: 0..3, ..block(4..8, 4, (4, 4), true) };

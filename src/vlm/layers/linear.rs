@@ -135,7 +135,7 @@ fn array<const N: usize>(parts: Vec<Tensor>) -> Result<[Tensor; N]> {
 /// Linear layers that read the same input: one product where their weights are packed and none has an addition of its own.
 pub struct JoinedLinear<const N: usize> {
     pub(super) form: Joined,
-    outputs: [usize; N],
+    pub(super) outputs: [usize; N],
 }
 
 pub(super) enum Joined {

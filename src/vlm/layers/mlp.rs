@@ -16,7 +16,7 @@ pub(super) enum GateUp {
 /// `down(silu(gate x) * up x)`, the MLP of both towers.
 pub struct GatedMlp {
     pub(super) inputs: GateUp,
-    down: Linear,
+    pub(super) down: Linear,
 }
 
 impl GatedMlp {

@@ -1,4 +1,5 @@
 use super::linear::{Joined, JoinedLinear, Linear};
+use super::matrix::Matrix;
 use super::mlp::{GateUp, GatedMlp};
 use crate::error::Error;
 use crate::kernels::{self, WeightFormat};
@@ -142,5 +143,29 @@ fn what_joined_layers_lack_is_listed_and_nothing_is_packed() {
             assert!(unexpected.is_empty(), "{unexpected:?}");
         }
         other => panic!("{other:?}"),
+    }
+}
+
+/// As matrices lie on another device than the CPU: plain tensors, which candle multiplies here in f16 but not in bf16.
+#[test]
+fn plain_matrices_of_a_rounded_type_give_what_those_of_f32_give() {
+    let linear = |outputs, inputs, seed, dtype| {
+        let weight = Matrix::Plain(random(&[outputs, inputs], seed).to_dtype(dtype).unwrap());
+        Linear { weight, bias: Some(random(&[outputs], seed + 1)), lora: None }
+    };
+    let (x, residual) = (random(&[5, WIDTH], 1), random(&[5, WIDTH], 2));
+    let run = |dtype| {
+        let inputs = GateUp::Apart { gate: linear(20, WIDTH, 1, dtype), up: linear(20, WIDTH, 3, dtype) };
+        let mlp = GatedMlp { inputs, down: linear(WIDTH, 20, 5, dtype) };
+        let layers = vec![linear(4, WIDTH, 7, dtype), linear(6, WIDTH, 9, dtype)];
+        let joined = JoinedLinear { form: Joined::Apart(layers), outputs: [4, 6] };
+        let [a, b] = joined.forward(&x).unwrap();
+        [mlp.forward_onto(&x, &residual).unwrap(), a, b].map(|t| values(&t))
+    };
+    let (exact, rounded) = (run(DType::F32), run(DType::F16));
+    for (exact, rounded) in exact.iter().zip(&rounded) {
+        let largest = exact.iter().fold(0f32, |m, v| m.max(v.abs()));
+        let off = exact.iter().zip(rounded).fold(0f32, |m, (a, b)| m.max((a - b).abs()));
+        assert!(off > 0.0 && off < 5e-3 * largest, "{off} of {largest}");
     }
 }
