@@ -5,8 +5,8 @@ use sdim::depth::sample_points;
 use sdim::internals::fusion::Normalise;
 use sdim::internals::model::{AskOptions, ask};
 use sdim::internals::query::Query;
+use sdim::internals::scenes::procedural;
 use sdim::refine::{Answered, EdgeAwareFill, Fill, FillInput};
-use sdim::scenes::procedural;
 use sdim::{CompleteOptions, DepthCompleter, QueryPlan};
 
 fn frame(c: &mut Criterion) {

@@ -5,7 +5,7 @@
 
 use anyhow::Context;
 use clap::Parser;
-use sdim::scenes::furnished::{Library, PackOptions, Reduction, Split};
+use sdim::internals::scenes::furnished::{Library, PackOptions, Reduction, Split};
 use std::path::PathBuf;
 
 #[derive(Parser)]

@@ -16,10 +16,10 @@ use anyhow::{Context, bail, ensure};
 use clap::Parser;
 use indicatif::{ProgressBar, ProgressStyle};
 use sdim::internals::query::PromptWriter;
+use sdim::internals::scenes::furnished::Library;
 use sdim::internals::supervise::{
     Asking, BatchConfig, FreshFiles, RecordConfig, RecordSet, SceneMix, Scenes, Shape,
 };
-use sdim::scenes::furnished::Library;
 use sdim::settings::Settings;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};

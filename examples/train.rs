@@ -9,8 +9,8 @@
 use anyhow::Context;
 use clap::parser::ValueSource;
 use clap::{ArgMatches, CommandFactory, FromArgMatches, Parser};
+use sdim::internals::supervise::{LabelSource, StepReport, TrainConfig, Trainer, evaluate};
 use sdim::settings::Settings;
-use sdim::supervise::{LabelSource, StepReport, TrainConfig, Trainer, evaluate};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::time::Instant;

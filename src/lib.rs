@@ -63,15 +63,15 @@
 //! | [`settings`] | how a checkpoint is asked: `sdim.json` |
 //! | [`chat`] | plain Qwen2.5-VL: ask a published checkpoint about a picture ([`chat::ChatModel`]) |
 //! | [`system`] | devices by name, memory |
-//! | `scenes`, `supervise`, `benchmarks`, `hub` | procedural scenes, training, data sets, the Hugging Face hub; each behind its feature |
+//! | `benchmarks`, `hub` | data sets, the Hugging Face hub; each behind its feature |
 //!
 //! # Features
 //!
 //! | feature | default | what |
 //! |---|---|---|
 //! | `tiny` | yes | the embedded checkpoint: [`DepthCompleter`]`::tiny` |
-//! | `train` | no | `scenes` and `supervise` |
-//! | `meshes` | no | `scenes` with rooms furnished by OBJ models |
+//! | `train` | no | what `examples/train.rs` and `examples/records.rs` are made of: scenes and the trainer; no public names yet |
+//! | `meshes` | no | the same with rooms furnished by OBJ models |
 //! | `benchmarks` | no | `benchmarks`: NYUv2, VOID, iBims-1, KITTI, DDAD, TUM, ScanNet, folders |
 //! | `hub` | no | `hub`: checkpoints by name; the one feature that builds C |
 //! | `cuda`, `cudnn`, `metal`, `accelerate`, `mkl` | no | candle's back ends |
@@ -107,9 +107,9 @@ mod model;
 mod query;
 pub mod refine;
 #[cfg(any(feature = "train", feature = "benchmarks", feature = "meshes"))]
-pub mod scenes;
+mod scenes;
 #[cfg(feature = "train")]
-pub mod supervise;
+mod supervise;
 pub mod system;
 mod vlm;
 
@@ -162,6 +162,14 @@ pub mod internals {
     pub mod query {
         pub use crate::query::*;
     }
+    #[cfg(feature = "benchmarks")]
+    pub mod benchmarks {
+        pub use crate::benchmarks::folder::{DepthFile, write_frame};
+    }
+    #[cfg(any(feature = "train", feature = "benchmarks", feature = "meshes"))]
+    pub mod scenes {
+        pub use crate::scenes::*;
+    }
     #[cfg(feature = "train")]
     pub mod supervise {
         pub use crate::supervise::batch::*;
@@ -171,6 +179,7 @@ pub mod internals {
         pub use crate::supervise::records::*;
         pub use crate::supervise::shape::*;
         pub use crate::supervise::shard::*;
+        pub use crate::supervise::*;
     }
     pub mod vlm {
         pub use crate::vlm::*;

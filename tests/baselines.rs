@@ -6,8 +6,8 @@ use proptest::prelude::*;
 use safetensors::SafeTensors;
 use sdim::classical::Baseline;
 use sdim::depth::sample_points;
+use sdim::internals::scenes::procedural;
 use sdim::metrics::errors;
-use sdim::scenes::procedural;
 use sdim::{Error, SparseDepth};
 
 /// A tensor of the fixture: (width, height, values).

@@ -4,7 +4,7 @@ mod common;
 
 use image::RgbImage;
 use sdim::depth::sample_points;
-use sdim::scenes::procedural;
+use sdim::internals::scenes::procedural;
 use sdim::{
     CompleteOptions, DepthCompleter, DepthMap, DepthScale, Error, Outliers, Preserve, QueryPlan, SparseDepth,
     read_rgb,

@@ -113,7 +113,7 @@ fn answers_are_equal_in_ten_runs_on_other_threads_and_almost_those_of_f32() {
 }
 
 fn frame() -> (RgbImage, SparseDepth) {
-    let frame = sdim::scenes::procedural(3_000_001, 160, 120).unwrap();
+    let frame = sdim::internals::scenes::procedural(3_000_001, 160, 120).unwrap();
     let sparse = sdim::depth::sample_points(&frame.depth, 160, 120, 200, 1).unwrap();
     (frame.rgb, sparse)
 }

@@ -5,8 +5,8 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use sdim::depth::SparsePattern;
 use sdim::depth::outliers::find;
+use sdim::internals::scenes::procedural;
 use sdim::metrics::errors;
-use sdim::scenes::procedural;
 use sdim::{
     CompleteOptions, Completion, DepthCompleter, DepthScale, Outliers, Preserve, QueryPlan, SparseDepth,
     read_rgb,

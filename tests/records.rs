@@ -9,13 +9,13 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 use sdim::internals::model::{CheckpointFiles, SdimModel};
 use sdim::internals::query::PromptWriter;
+use sdim::internals::scenes::furnished::Library;
 use sdim::internals::supervise::{
     Asking, BatchConfig, BinLoss, Example, RecordConfig, RecordSet, SceneMix, Scenes, Shard, Target, VERSION,
     bins, example_of, frame, held_out_seed, training_seed,
 };
 use sdim::internals::vlm::qwen2_5::decoder::Keep;
 use sdim::internals::vlm::qwen2_5::sequences::Sequences;
-use sdim::scenes::furnished::Library;
 use sdim::settings::{Hint, Settings};
 use sdim::{Error, LoadOptions, Result, WeightFormat};
 use std::path::{Path, PathBuf};
@@ -250,9 +250,9 @@ fn a_mix_is_the_same_on_any_number_of_threads_and_keeps_its_parts_apart() {
     }
     let ids = |held_out| {
         let part = if held_out {
-            sdim::scenes::furnished::Split::HeldOut
+            sdim::internals::scenes::furnished::Split::HeldOut
         } else {
-            sdim::scenes::furnished::Split::Train
+            sdim::internals::scenes::furnished::Split::Train
         };
         library.part(part).unwrap().models().into_iter().map(|m| m.id).collect::<Vec<_>>()
     };

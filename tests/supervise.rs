@@ -2,11 +2,11 @@
 
 use sdim::Error;
 use sdim::internals::model::SdimModel;
+use sdim::internals::supervise::{LabelSource, TrainConfig, Trainer};
 use sdim::settings::{
     AnswerMode, Generation, LoraConfig, Marker, MeasurementPrompt, NumberFormat, PixelReference,
     PromptTemplate, Settings,
 };
-use sdim::supervise::{LabelSource, TrainConfig, Trainer};
 use std::path::Path;
 
 fn small() -> TrainConfig {

@@ -96,14 +96,22 @@ train() {
     elif [ "${gpus:-0}" -gt 1 ]; then
         launch=("$python" -m torch.distributed.run --standalone --nproc-per-node "$gpus" -m sdim_training.train)
     fi
-    # The trainer itself ends in time; a signal makes it save and end, should it be late.
-    # shellcheck disable=SC2086
-    timeout --kill-after=4 --signal=TERM $((end - $(date +%s) - 12)) "${launch[@]}" --records "$work/train" \
-        --init "${!init:-$work/fresh/$name}" --out "$work/out/$name" --held-out "$work"/held/* --pictures "$work/pictures" \
-        --follow --wait-frames "${WAIT_FRAMES:-1024}" --batch "${BATCH:-64}" --rate "${RATE:-1.5e-3}" \
-        --seed "${SEED:-7}" --until $((end - 18)) ${TRAIN_ARGS:-} ${!own:-} 2>&1 | tee "$work/logs/log-$name.txt"
-    local status=${PIPESTATUS[0]}
-    [ "$status" -eq 0 ] || echo "the trainer of $name ended with $status"
+    local plain= status started
+    # A machine whose compiler fails trains all the same, more slowly.
+    while :; do
+        started=$(date +%s)
+        # The trainer itself ends in time; a signal makes it save and end, should it be late.
+        # shellcheck disable=SC2086
+        timeout --kill-after=4 --signal=TERM $((end - $(date +%s) - 12)) "${launch[@]}" --records "$work/train" \
+            --init "${!init:-$work/fresh/$name}" --out "$work/out/$name" --held-out "$work"/held/* --pictures "$work/pictures" \
+            --follow --wait-frames "${WAIT_FRAMES:-1024}" --batch "${BATCH:-64}" --rate "${RATE:-1.5e-3}" \
+            --seed "${SEED:-7}" --until $((end - 18)) ${TRAIN_ARGS:-} ${!own:-} $plain 2>&1 | tee -a "$work/logs/log-$name.txt"
+        status=${PIPESTATUS[0]}
+        [ "$status" -ne 0 ] || break
+        echo "the trainer of $name ended with $status after $(($(date +%s) - started)) s"
+        [ -z "$plain" ] && [ $(($(date +%s) - started)) -lt 150 ] && [ $((end - $(date +%s))) -gt 60 ] || break
+        plain=--no-compile
+    done
 }
 
 run() {

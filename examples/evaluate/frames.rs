@@ -4,8 +4,8 @@ use crate::Args;
 use crate::settings::Fnv;
 use anyhow::Context;
 use sdim::benchmarks::{Dataset, LayoutOptions, Sample};
-use sdim::scenes::furnished::{Library, Split, furnished};
-use sdim::scenes::{RgbdFrame, procedural};
+use sdim::internals::scenes::furnished::{Library, Split, furnished};
+use sdim::internals::scenes::{RgbdFrame, procedural};
 use std::path::Path;
 
 /// Seeds from here on are never drawn in training with the default configuration.

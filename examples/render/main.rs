@@ -13,11 +13,11 @@ use anyhow::{Context, bail};
 use clap::{Parser, ValueEnum};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
-use sdim::benchmarks::{DepthFile, write_frame};
 use sdim::depth::{io, sample_points};
+use sdim::internals::benchmarks::{DepthFile, write_frame};
+use sdim::internals::scenes::furnished::{Library, Split, furnished};
+use sdim::internals::scenes::{RgbdFrame, SpinningLidar, procedural, street};
 use sdim::internals::supervise::{self, BatchConfig, SceneMix, Scenes, mix, told_and_asked, training_seed};
-use sdim::scenes::furnished::{Library, Split, furnished};
-use sdim::scenes::{RgbdFrame, SpinningLidar, procedural, street};
 use sdim::{DepthScale, SparseDepth};
 use std::path::PathBuf;
 

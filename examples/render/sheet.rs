@@ -4,7 +4,7 @@ use anyhow::Context;
 use image::{Rgb, RgbImage, imageops};
 use sdim::SparseDepth;
 use sdim::draw::colour::{depth_range, depth_to_rgb};
-use sdim::scenes::RgbdFrame;
+use sdim::internals::scenes::RgbdFrame;
 use std::path::Path;
 
 /// Pairs of a frame and its depth in a row.

@@ -17,9 +17,7 @@ mod store;
 mod trainer;
 mod vocabulary;
 
-pub use batch::{BatchConfig, LabelSource};
 pub use config::TrainConfig;
 pub use evaluate::{HeldOut, evaluate};
-pub use mix::SceneMix;
 pub use optimiser::AdamW;
 pub use trainer::{StepReport, Trainer};

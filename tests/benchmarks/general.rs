@@ -2,9 +2,10 @@
 
 use std::fs;
 
-use sdim::benchmarks::{DepthFile, Layout, LayoutOptions, frame_seed, write_frame};
+use sdim::benchmarks::{Layout, LayoutOptions, frame_seed};
 use sdim::depth::SparsePattern;
 use sdim::depth::io;
+use sdim::internals::benchmarks::{DepthFile, write_frame};
 use sdim::{DepthScale, Error};
 
 use crate::copies::{H, W, kitti, picture, scannet};
@@ -89,7 +90,7 @@ fn a_list_chooses_frames_in_its_order() {
 
     // Any layout, with its measurements; a name itself goes before what else is spelled like it.
     let dir = tempfile::tempdir().unwrap();
-    let frame = sdim::scenes::procedural(3, 16, 12).unwrap();
+    let frame = sdim::internals::scenes::procedural(3, 16, 12).unwrap();
     for name in ["07", "7", "8"] {
         write_frame(dir.path(), name, &frame, DepthFile::Npy).unwrap();
     }

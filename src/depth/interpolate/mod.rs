@@ -5,7 +5,7 @@ pub(crate) mod mesh;
 use rayon::prelude::*;
 
 use super::SparseDepth;
-use super::pixels::{check_length, faces_a_hole, pixel_count};
+use super::pixels::faces_a_hole;
 use crate::error::Result;
 use mesh::{Mesh, Owner, cross};
 
@@ -148,9 +148,8 @@ fn nearest_columns(y: usize, found: &[u32]) -> impl Iterator<Item = usize> {
 /// The triangulation, and which triangle holds which pixel, is computed once. Outside the hull of the points, and everywhere
 /// if they lie on one line, the value is that of the nearest point. Of several points at one position the first counts.
 #[derive(Debug)]
-pub struct Interpolator {
+pub(crate) struct Interpolator {
     mesh: Mesh,
-    points: usize,
 }
 
 impl Interpolator {
@@ -160,19 +159,14 @@ impl Interpolator {
     /// [`Error::NoMeasurement`](crate::error::Error::NoMeasurement) without points,
     /// [`Error::Argument`](crate::error::Error::Argument) for a coordinate that is not finite,
     /// [`Error::ImageSize`](crate::error::Error::ImageSize) for an empty or absurdly large frame.
-    pub fn new(points: &[(f32, f32)], width: usize, height: usize) -> Result<Self> {
-        Ok(Self { mesh: Mesh::new(points, width, height)?, points: points.len() })
-    }
-
-    /// Number of points given to [`Interpolator::new`]: the number of values to pass.
-    pub fn points(&self) -> usize {
-        self.points
+    pub(crate) fn new(points: &[(f32, f32)], width: usize, height: usize) -> Result<Self> {
+        Ok(Self { mesh: Mesh::new(points, width, height)? })
     }
 
     /// The value at any position, in the unit of `values` (one per point, in the order of the points).
     ///
     /// NaN for a position that is not finite, and where the values needed are absent or NaN.
-    pub fn at(&self, x: f32, y: f32, values: &[f32]) -> f32 {
+    pub(crate) fn at(&self, x: f32, y: f32, values: &[f32]) -> f32 {
         if !(x.is_finite() && y.is_finite()) {
             return f32::NAN;
         }
@@ -192,20 +186,10 @@ impl Interpolator {
     /// The values at all pixel centres (integer coordinates) of the frame, row-major, `width * height`.
     ///
     /// A point that lies on a pixel gives that pixel its value bit for bit. NaN where the values needed are absent or NaN.
-    pub fn raster(&self, values: &[f32]) -> Vec<f32> {
+    pub(crate) fn raster(&self, values: &[f32]) -> Vec<f32> {
         let mut out = vec![0.0; self.mesh.width * self.mesh.height];
         self.paint(values, &mut out);
         out
-    }
-
-    /// As [`Interpolator::raster`], into a buffer of the caller.
-    ///
-    /// # Errors
-    /// [`Error::BufferLength`](crate::error::Error::BufferLength) unless `out` holds `width * height` values.
-    pub fn raster_into(&self, values: &[f32], out: &mut [f32]) -> Result<()> {
-        check_length("raster", out.len(), pixel_count(self.mesh.width, self.mesh.height)?)?;
-        self.paint(values, out);
-        Ok(())
     }
 
     /// The points whose values make the value at a pixel of the frame, with their weights, which sum to 1.

@@ -191,5 +191,4 @@ fn bad_input_is_refused() {
     assert!(matches!(Interpolator::new(&[(0.0, 0.0)], 0, 4), Err(Error::ImageSize { .. })));
     let mesh = Interpolator::new(&[(0.0, 0.0), (3.0, 0.0), (0.0, 3.0)], 4, 4).unwrap();
     assert!(mesh.raster(&[1.0]).iter().any(|v| v.is_nan()), "missing values must not be invented");
-    assert!(matches!(mesh.raster_into(&[1.0; 3], &mut [0.0; 3]), Err(Error::BufferLength { .. })));
 }
