@@ -93,7 +93,7 @@ fn running_statistics_are_published_averaged_as_weights_are() {
     let mut trainer = Trainer::new(config, &Settings::tiny()).unwrap();
     let name = |n: &&String| n.contains(".running_") || n.ends_with("gate_proj.weight");
     let names: Vec<String> = trainer.parameters.all.keys().filter(name).cloned().collect();
-    assert_eq!(names.len(), 8 + 8);
+    assert_eq!(names.len(), 8 + 10);
     let mut averages: Vec<Vec<f32>> =
         names.iter().map(|n| trainer.parameters.all[n].values().to_vec()).collect();
     for step in 1..=10 {
