@@ -23,11 +23,11 @@ pub enum Preserve {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Outliers {
     /// Their pixels are completed as if nothing had been measured there.
+    #[default]
     Ignore,
     /// As `Ignore`, but the map keeps their measurement, where it keeps measurements at all ([`Preserve::Keep`]).
     Preserve,
-    /// Measurements are not checked: all of them count, and none is flagged.
-    #[default]
+    /// Measurements are not checked: all of them count, and none is flagged. For a sensor that is never wrong.
     Trust,
 }
 
