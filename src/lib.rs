@@ -176,6 +176,7 @@ pub mod internals {
         pub use crate::supervise::init::*;
         pub use crate::supervise::loss::*;
         pub use crate::supervise::mix::*;
+        pub use crate::supervise::recipe::*;
         pub use crate::supervise::records::*;
         pub use crate::supervise::shape::*;
         pub use crate::supervise::shard::*;

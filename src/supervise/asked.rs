@@ -1,10 +1,12 @@
 //! Which pixels of a training frame are asked.
 
-use super::batch::Asked;
 use crate::depth::SparseDepth;
 use crate::scenes::RgbdFrame;
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
+
+/// Pixels to ask with their true depths, metres.
+pub(super) type Asked = Vec<(usize, usize, f32)>;
 
 /// Pixels to ask and their true depths, `count` of them, a share of them near depth edges. Pixels that were measured are
 /// asked less the more of them there are: a dense map is asked where it has holes.

@@ -1,8 +1,9 @@
 //! From a seed to a training batch: frames, measurements, questions and their true answers.
 
-use super::asked::questions;
+use super::asked::{Asked, questions};
 use super::measure::{measure, spoil};
-use super::mix::{SceneMix, Scenes};
+use super::mix::Scenes;
+use super::recipe::{BatchConfig, LabelSource};
 use crate::depth::SparseDepth;
 use crate::depth::interpolate::Interpolator;
 use crate::error::{Error, Result};
@@ -20,63 +21,6 @@ use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 use rayon::prelude::*;
-
-/// Where the true answers come from.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum LabelSource {
-    /// Measurements that are held back from the prompt: needs no ground truth (the paper's "w/ SD").
-    Sparse,
-    /// The dense ground truth (the paper's "w/ GT").
-    Dense,
-}
-
-/// What a batch is made of.
-#[derive(Debug, Clone, PartialEq, serde::Serialize, serde::Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct BatchConfig {
-    /// Frames per step.
-    pub frames: usize,
-    /// Questions per frame.
-    pub questions: usize,
-    /// Measurements in the prompt, at most.
-    pub prompt_points: usize,
-    /// Fewest and most measurements per frame.
-    pub points: (usize, usize),
-    /// Where labels come from.
-    pub labels: LabelSource,
-    /// Frame sizes, one drawn per step; multiples of patch x merge.
-    pub sizes: Vec<(usize, usize)>,
-    /// Share of the frames that pass through a random camera and depth sensor; labels stay clean.
-    #[serde(default)]
-    pub sensors: f32,
-    /// Share of the frames among whose measurements are bad ones: saturated, gross errors, left-overs at the border.
-    #[serde(default)]
-    pub errors: f32,
-    /// Share of the questions that are drawn near depth edges; the others are drawn from all known pixels.
-    #[serde(default)]
-    pub edges: f32,
-    /// Which scenes the frames show.
-    #[serde(default)]
-    pub mix: SceneMix,
-}
-
-impl Default for BatchConfig {
-    fn default() -> Self {
-        Self {
-            frames: 8,
-            questions: 128,
-            prompt_points: 256,
-            points: (40, 1500),
-            labels: LabelSource::Dense,
-            sizes: vec![(256, 192), (256, 192), (224, 224), (272, 160), (320, 144), (192, 256)],
-            sensors: 0.6,
-            errors: 0.35,
-            edges: 0.3,
-            mix: SceneMix::default(),
-        }
-    }
-}
 
 /// One frame's part of a batch.
 pub struct Example {
@@ -220,9 +164,6 @@ pub(super) fn example_again(
     let (told, asked) = told_and_asked(&mut frame, config, picture, rng)?;
     written(asking, &frame.rgb, &told, config.prompt_points, &asked, rng.random())
 }
-
-/// Pixels to ask with their true depths, metres.
-pub(super) type Asked = Vec<(usize, usize, f32)>;
 
 /// Measures a frame, which a random camera may have taken afterwards unless there is a `picture` of it. What is told may be wrong, what is asked is not.
 ///

@@ -1,7 +1,7 @@
 //! The configuration of a training run.
 
-use super::batch::BatchConfig;
 use super::optimiser::AdamW;
+use super::recipe::BatchConfig;
 use crate::error::{Error, Result};
 use crate::files::{read_text, write_whole};
 use std::path::Path;
@@ -139,7 +139,7 @@ mod tests {
     fn what_is_written_is_read_back() {
         let dir = tempfile::tempdir().unwrap();
         let mut config = TrainConfig { rate: 1.0 / 3.0, seed: u64::MAX, ..Default::default() };
-        config.batch.labels = crate::supervise::batch::LabelSource::Sparse;
+        config.batch.labels = crate::supervise::recipe::LabelSource::Sparse;
         config.optimiser.eps = f32::MIN_POSITIVE;
         config.save(dir.path()).unwrap();
         assert_eq!(TrainConfig::load(dir.path()).unwrap(), config);

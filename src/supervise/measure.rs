@@ -1,6 +1,6 @@
 //! What a training frame's sensor measures: patterns of measurements, faulty sensors, and measurements that are wrong.
 
-use super::batch::BatchConfig;
+use super::recipe::BatchConfig;
 use crate::depth::{SparseDepth, SparsePattern};
 use crate::error::Result;
 use crate::scenes::sensor::{CameraModel, DepthSensor};

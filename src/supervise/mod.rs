@@ -10,6 +10,7 @@ mod measure;
 pub(crate) mod mix;
 mod optimiser;
 mod pass;
+pub(crate) mod recipe;
 pub(crate) mod records;
 pub(crate) mod shape;
 pub(crate) mod shard;

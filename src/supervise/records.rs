@@ -1,10 +1,9 @@
 //! Which records a set holds: frames, variants and questions by number, the same for the same seed wherever they are made.
 
 use super::asked::questions;
-use super::batch::{
-    Asking, BatchConfig, Example, example_again, frame, held_out_seed, mix, training_seed, written,
-};
+use super::batch::{Asking, Example, example_again, frame, held_out_seed, mix, training_seed, written};
 use super::mix::Scenes;
+use super::recipe::BatchConfig;
 use super::shard::{About, Dims, Shard, VERSION};
 use crate::depth::SparsePattern;
 use crate::error::{Error, Result};
