@@ -23,7 +23,7 @@ pub fn rms_norm(x: &Tensor, weight: &Tensor, eps: f64) -> Result<Tensor> {
     if !on_cpu(&[x, weight]) {
         return composed(x, weight, eps);
     }
-    let op = RmsNorm { eps: eps as f32 };
+    let op = RmsNormOp { eps: eps as f32 };
     Ok(x.contiguous()?.apply_op2(&weight.contiguous()?, op)?)
 }
 
@@ -36,7 +36,8 @@ fn composed(x: &Tensor, weight: &Tensor, eps: f64) -> Result<Tensor> {
     Ok(x.broadcast_div(&(mean + eps)?.sqrt()?)?.broadcast_mul(weight)?)
 }
 
-struct RmsNorm {
+/// [`rms_norm`] on the CPU, as candle's custom operation.
+struct RmsNormOp {
     eps: f32,
 }
 
@@ -95,7 +96,7 @@ fn backward_body<S: Isa>(
 }
 per_level!(fn backward_chunk(dx: &mut [f32], dw: &mut [f32], x: &[f32], weight: &[f32], grad: &[f32], eps: f32) = backward_body);
 
-impl CustomOp2 for RmsNorm {
+impl CustomOp2 for RmsNormOp {
     fn name(&self) -> &'static str {
         "rms-norm"
     }
