@@ -152,7 +152,7 @@ impl CustomOp2 for RmsNormOp {
 mod tests {
     use super::*;
     use crate::kernels::testing::{
-        at_every_level, check_gradients, close, gradients, random, same_on_any_thread_count,
+        at_every_level, check_gradients, close, gradients, on_device, random, same_on_any_thread_count,
     };
 
     #[test]
@@ -168,9 +168,10 @@ mod tests {
     fn the_composed_forms_are_the_kernel() {
         let (x, w) = (random(&[70, 48], 1), random(&[48], 2));
         let expected = rms_norm(&x, &w, 1e-6).unwrap();
-        let tracked = candle_core::Var::from_tensor(&x).unwrap();
-        for form in [&x, tracked.as_tensor()] {
-            close(&composed(form, &w, 1e-6).unwrap(), &expected, 1e-5);
+        let [there, weight] = on_device([&x, &w]);
+        let tracked = candle_core::Var::from_tensor(&there).unwrap();
+        for form in [&there, tracked.as_tensor()] {
+            close(&composed(form, &weight, 1e-6).unwrap(), &expected, 1e-5);
         }
         let rows = x.narrow(0, 0, 0).unwrap();
         assert_eq!(composed(&rows, &w, 1e-6).unwrap().dims(), [0, 48]);
