@@ -7,19 +7,13 @@ use rand_chacha::rand_core::SeedableRng;
 
 /// At most `max` measurements (column, row, metres), as [`choose_evenly`] chooses them; where numbers are counted in the largest one,
 /// it is among them.
-pub(super) fn told(
-    sparse: &SparseDepth,
-    unit: DepthUnit,
-    max: usize,
-    seed: u64,
-) -> Vec<(usize, usize, f32)> {
+pub(super) fn told(sparse: &SparseDepth, unit: DepthUnit, max: usize, seed: u64) -> Vec<(usize, usize, f32)> {
     let chosen = choose_evenly(sparse, max, seed);
     match unit {
         DepthUnit::FrameMax => with_largest(chosen, sparse),
-        DepthUnit::Metres
-        | DepthUnit::Centimetres
-        | DepthUnit::Millimetres
-        | DepthUnit::FrameMedian => chosen,
+        DepthUnit::Metres | DepthUnit::Centimetres | DepthUnit::Millimetres | DepthUnit::FrameMedian => {
+            chosen
+        }
     }
 }
 

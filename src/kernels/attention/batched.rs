@@ -246,8 +246,7 @@ mod tests {
         for (layout, pair) in cases() {
             let (q, k, v) = (random(&[50, 48], 1), random(&[70, 16], 2), random(&[70, 16], 3));
             let extra = pair.then(|| (random(&[20, 16], 4), random(&[20, 16], 5)));
-            let expected =
-                composed(&q, &k, &v, extra.as_ref().map(|(k, v)| (k, v)), &layout).unwrap();
+            let expected = composed(&q, &k, &v, extra.as_ref().map(|(k, v)| (k, v)), &layout).unwrap();
             let [q, k, v] = on_device([&q, &k, &v]);
             let extra = extra.map(|(k, v)| on_device([&k, &v]));
             let extra = extra.as_ref().map(|[k, v]| (k, v));
