@@ -56,6 +56,9 @@ struct Args {
     /// cpu, cuda:N or metal.
     #[arg(long, default_value = "cpu")]
     device: String,
+    /// Megabytes (2^20 bytes) that a batch of questions may take beside the weights, about; the answers are the same for any number.
+    #[arg(long, value_name = "MB")]
+    max_memory: Option<usize>,
     /// Completes the frame so many times; results and seconds are those of the last time.
     #[arg(long, default_value_t = 1)]
     repeat: usize,
@@ -118,7 +121,7 @@ fn main() -> anyhow::Result<()> {
 
     let bar = bar()?;
     let ticker = bar.clone();
-    let options = CompleteOptions::default()
+    let mut options = CompleteOptions::default()
         .with_plan(args.plan)
         .with_readout(args.readout)
         .with_outliers(args.outliers)
@@ -126,6 +129,9 @@ fn main() -> anyhow::Result<()> {
             ticker.set_length(p.planned as u64);
             ticker.set_position(p.answered as u64);
         });
+    if let Some(megabytes) = args.max_memory {
+        options = options.with_max_memory(megabytes.saturating_mul(1 << 20));
+    }
     let mut done = completer.complete_detailed(&frame.rgb, &frame.sparse, &options)?;
     let first_seconds = done.seconds.total;
     for _ in 1..args.repeat {

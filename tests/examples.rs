@@ -45,7 +45,7 @@ fn complete_does_its_work_when_nobody_reads_on() {
     for json in [&["--json"][..], &[]] {
         let dir = tempfile::tempdir().unwrap();
         let mut command = Command::new(program("complete"));
-        command.args(["--plan", "stride:32", "--out", text(dir.path())]).args(json);
+        command.args(["--plan", "stride:32", "--max-memory", "1", "--out", text(dir.path())]).args(json);
         let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
         drop(child.stdout.take());
         let out = child.wait_with_output().unwrap();

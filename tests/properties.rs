@@ -5,7 +5,7 @@ use proptest::prelude::*;
 use sdim::internals::query::bins::{Bins, Spacing};
 use sdim::internals::query::number::DigitReader;
 use sdim::internals::query::plan::{lattice, stride_within};
-use sdim::internals::query::prompt::choose_evenly;
+use sdim::internals::query::told::choose_evenly;
 use sdim::internals::vlm::qwen2_5::preprocess::PreprocessorConfig;
 use sdim::{DepthScale, Error, SparseDepth};
 

@@ -219,5 +219,5 @@ collect() {
 case "${1:-}" in
 pack) pack ;;
 run) shift && run "$@" ;;
-*) sed -n '2,25p' "$0" && exit 2 ;;
+*) sed -n '2,/^set -/{/^#/p}' "$0" && exit 2 ;;
 esac

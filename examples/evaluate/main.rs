@@ -89,7 +89,7 @@ pub struct Args {
     /// the benchmark's protocol says, else 500. An error where all frames have their own (void, kitti, ddad, nyu with its hints).
     #[arg(long, value_delimiter = ',')]
     points: Vec<usize>,
-    /// How they are spread: uniform (the default), lidar:LINES or sfm.
+    /// How they are spread: uniform (the default), sfm, line, grid, hole, lidar:LINES or block:SIDE.
     #[arg(long)]
     pattern: Option<String>,
     /// Draw points from the ground truth even where a frame has measurements of its own.

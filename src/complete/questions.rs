@@ -8,7 +8,7 @@ use crate::depth::{DepthMap, SparseDepth, interpolate};
 use crate::error::Result;
 use crate::model::{AskOptions, Prefix, SdimModel, ask};
 use crate::query::plan::{Asked, lattice, refine_pixels, stride_within};
-use crate::query::prompt::choose_evenly;
+use crate::query::told::choose_evenly;
 use crate::query::{Hint, Query, QueryPlan, Reading};
 use crate::refine::{Answered, FillInput};
 use image::RgbImage;

@@ -13,7 +13,8 @@
 //! From the bottom up: `isa` finds the instruction sets and compiles functions for them, `simd` has their registers; `gemm` multiplies
 //! matrices; `attention` and `ops` are what layers call. `exec` and `written` reach tensors' data and make results.
 //!
-//! This module knows nothing of images or depth, and is the only home of `unsafe` in the crate.
+//! This module knows nothing of images or depth, and is the home of `unsafe` in the crate: all of it but the one call that maps files, in
+//! `vlm/checkpoint/stored.rs`.
 
 mod attention;
 #[cfg(feature = "cuda")]

@@ -4,6 +4,7 @@ use crate::error::Result;
 use crate::kernels::isa::{Level, forced};
 use candle_core::{Device, Tensor, Var};
 use rand::{Rng, SeedableRng};
+use std::sync::LazyLock;
 
 /// Uniform in -1..1.
 pub(super) fn random(dims: &[usize], seed: u64) -> Tensor {
@@ -11,6 +12,16 @@ pub(super) fn random(dims: &[usize], seed: u64) -> Tensor {
     let n = dims.iter().product();
     let data: Vec<f32> = (0..n).map(|_| rng.random_range(-1.0..1.0)).collect();
     Tensor::from_vec(data, dims, &Device::Cpu).unwrap()
+}
+
+/// These tensors on the device that `SDIM_TEST_DEVICE` names (`cuda:0`), the CPU without it: where the forms for other devices than the
+/// CPU are compared with the kernels, whose results stay on the CPU.
+pub(super) fn on_device<const N: usize>(tensors: [&Tensor; N]) -> [Tensor; N] {
+    static DEVICE: LazyLock<Device> = LazyLock::new(|| {
+        let name = std::env::var("SDIM_TEST_DEVICE").unwrap_or_else(|_| "cpu".into());
+        crate::system::device(&name).unwrap()
+    });
+    tensors.map(|t| t.to_device(&DEVICE).unwrap())
 }
 
 pub(super) fn values(t: &Tensor) -> Vec<f32> {

@@ -284,7 +284,7 @@ mod tests {
         let paper = AnswerGrammar::new(&PromptTemplate::paper(), 2.0);
         assert_eq!(paper.parse("0.5"), Err(Unreadable::NoUnit));
         let tiny = AnswerGrammar::new(&PromptTemplate::tiny(), 2.0);
-        assert_eq!(tiny.parse("0.5").map(|p| p.metres), Ok(1.0), "half of the largest measurement");
+        assert_eq!(tiny.parse("0.5").map(|p| p.metres), Ok(1.0), "half a unit of two metres");
         assert_eq!(tiny.parse(" 0.5 m").map(|p| p.metres), Ok(0.5));
         assert_eq!(tiny.parse("<answer> 0.5 </answer>").map(|p| p.metres), Ok(1.0));
         let own = PromptTemplate { answer: "d = {y} cm, I think".into(), ..PromptTemplate::paper() };

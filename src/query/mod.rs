@@ -12,6 +12,7 @@ pub mod prompt;
 pub mod reading;
 pub mod settings;
 pub mod template;
+pub mod told;
 mod unit;
 
 pub use grammar::{AnswerGrammar, parse_depth};

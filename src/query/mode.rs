@@ -8,7 +8,8 @@ use crate::error::{Error, Result};
 #[derive(Debug, Clone, PartialEq, Default, serde::Serialize, serde::Deserialize)]
 #[serde(tag = "kind", rename_all = "snake_case")]
 pub enum AnswerMode {
-    /// The answer's words are forced, and its number is chosen among numbers: always readable, and the fewest passes.
+    /// The answer's words are forced, and its number is chosen among numbers: always readable, and the fewest passes. The number has
+    /// the checkpoint's [`NumberFormat`]: one bin, or digits one after the other.
     #[default]
     Digits,
     /// The model speaks freely, and what it says is read by [`super::AnswerGrammar`].

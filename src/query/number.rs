@@ -35,11 +35,12 @@ impl DepthUnit {
 
     /// Metres of the number 1 in a frame with these measurements; 1 where the frame decides but has none.
     pub fn metres_in(self, sparse: &SparseDepth) -> f32 {
-        let decided = match self {
+        let metres = match self {
+            Self::Metres | Self::Centimetres | Self::Millimetres => self.metres(),
+            Self::FrameMax => sparse.max(),
             Self::FrameMedian => sparse.median(),
-            _ => sparse.max(),
         };
-        self.metres().or(decided).unwrap_or(1.0)
+        metres.unwrap_or(1.0)
     }
 }
 

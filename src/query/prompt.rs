@@ -1,7 +1,8 @@
 //! From a frame to tokens: the shared prefix, and one suffix per asked pixel.
 
-use super::number::{DepthUnit, NumberFormat, Numbers};
+use super::number::{NumberFormat, Numbers};
 use super::settings::{MeasurementPrompt, PixelReference, Settings};
+use super::told::told;
 use crate::depth::SparseDepth;
 use crate::error::{Error, Result};
 use crate::vlm::chat::tokenizer::Tokenizer;
@@ -9,8 +10,6 @@ use crate::vlm::qwen2_5::config::VlmConfig;
 use crate::vlm::qwen2_5::grid::Grid;
 use crate::vlm::qwen2_5::positions::positions;
 use crate::vlm::qwen2_5::rope::Position;
-use rand::seq::SliceRandom;
-use rand_chacha::rand_core::SeedableRng;
 
 /// Ids and positions of a run of tokens.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -97,7 +96,8 @@ pub struct FrameSpace {
     pub position_scale: f32,
     /// Position of the text token that follows the prefix.
     pub next: f32,
-    /// Metres per number unit.
+    /// Metres of the number 1 in this frame, as [`PromptWriter::unit`] gives them. Depths in metres are divided by it where they become
+    /// numbers of a prompt; `model::ask` multiplies answers by it.
     pub unit: f32,
 }
 
@@ -272,11 +272,7 @@ impl PromptWriter {
             unit: self.unit(sparse),
         };
         if let MeasurementPrompt::Prefix { max } = self.settings.measurements {
-            let mut told = choose_evenly(sparse, max.min(points), seed);
-            if self.settings.unit == DepthUnit::FrameMax {
-                told = with_largest(told, sparse);
-            }
-            for (x, y, depth) in told {
+            for (x, y, depth) in told(sparse, self.settings.unit, max.min(points), seed) {
                 tokens.push_at(&self.numbers.write_ids(depth / space.unit), (x, y), MEASURED_TIME, &space);
             }
         }
@@ -358,51 +354,4 @@ impl PromptWriter {
             .replace("{row}", &along(query.y, space.height, space.resized.1).to_string());
         words.replace("{mask}", &mask).replace("{pixel}", &pixel)
     }
-}
-
-/// The largest measurement is what numbers are counted in, so it is always told: in the last one's place if need be.
-fn with_largest(mut chosen: Vec<(usize, usize, f32)>, sparse: &SparseDepth) -> Vec<(usize, usize, f32)> {
-    let top = sparse.points().max_by(|a, b| a.2.total_cmp(&b.2));
-    let told = |top: &_| chosen.contains(top);
-    if let Some(top) = top.filter(|top| !told(top))
-        && let Some(last) = chosen.last_mut()
-    {
-        *last = top;
-    }
-    chosen
-}
-
-/// At most `max` measurements, spread evenly over the frame, in a shuffled order that depends on the seed alone.
-///
-/// With too many, the frame is cut into about `max` cells and each gives the measurement nearest to its centre; what
-/// is left over is filled from the rest.
-pub fn choose_evenly(sparse: &SparseDepth, max: usize, seed: u64) -> Vec<(usize, usize, f32)> {
-    let mut points: Vec<(usize, usize, f32)> = sparse.points().collect();
-    let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
-    points.shuffle(&mut rng);
-    if points.len() <= max || max == 0 {
-        points.truncate(max);
-        return points;
-    }
-    let side = ((sparse.width() * sparse.height()) as f32 / max as f32).sqrt().max(1.0);
-    let cols = (sparse.width() as f32 / side).ceil() as usize;
-    let rows = (sparse.height() as f32 / side).ceil() as usize;
-    let mut best: Vec<Option<(f32, usize)>> = vec![None; cols * rows];
-    for (i, &(x, y, _)) in points.iter().enumerate() {
-        let (fx, fy) = (x as f32 / side, y as f32 / side);
-        let cell = (fy as usize).min(rows - 1) * cols + (fx as usize).min(cols - 1);
-        let off = (fx.fract() - 0.5).powi(2) + (fy.fract() - 0.5).powi(2);
-        if best[cell].is_none_or(|(b, _)| off < b) {
-            best[cell] = Some((off, i));
-        }
-    }
-    let mut taken = vec![false; points.len()];
-    for (_, i) in best.into_iter().flatten() {
-        taken[i] = true;
-    }
-    let (mut chosen, rest): (Vec<_>, Vec<_>) = points.iter().zip(&taken).partition(|(_, t)| **t);
-    chosen.extend(rest);
-    let mut chosen: Vec<_> = chosen.into_iter().map(|(p, _)| *p).take(max).collect();
-    chosen.shuffle(&mut rng);
-    chosen
 }

@@ -3,12 +3,17 @@
 use crate::error::{Error, Result};
 use std::str::FromStr;
 
-/// An answer in units of the frame.
+/// What one answer says.
+///
+/// What [`Bins`](super::bins::Bins) and [`DigitReader`](super::number::DigitReader) read is in number units, of which the frame's
+/// [`FrameSpace::unit`](super::FrameSpace) says the metres. What `model::ask` returns, and all that follows it, is in metres.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Reading {
-    /// Median of the distribution; NaN if nothing could be read.
+    /// Of bins the median or the mean of the distribution, as [`Readout`] says; of digits and words the number that was said.
+    /// NaN if nothing could be read.
     pub value: f32,
-    /// Probability that the truth lies within 5 % of `value`, as the model sees it; in 0..=1, higher is surer.
+    /// Probability that the truth lies within 5 % of `value` (of bins: and at least one bin), as the model sees it; in 0..=1, higher is
+    /// surer.
     pub confidence: f32,
     /// Expected absolute error, same unit as `value`.
     pub expected_error: f32,

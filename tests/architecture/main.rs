@@ -6,7 +6,8 @@
 //!   is compiled for tests alone (`#[cfg(test)]`) do not count, nor does what a `macro_rules!` body names, which is used where
 //!   the macro is. Items that macros make count as the file's in whose module they are found, and a glob import as a use of the
 //!   module's file. Method calls are not seen.
-//! - **Arrows between rooms go one way**: what each folder may not use stands in [`APART`].
+//! - **Arrows between rooms go one way**: what each room may use stands in the table of `ARCHITECTURE.md`, "Rooms".
+//! - **`unsafe` has one room**, `kernels`, but for the files of [`UNSAFE_OUTSIDE`].
 //! - **Nothing is too long**: files have at most 400 lines, functions 80, in `src`, `examples`, `benches` and `tests`.
 //!
 //! What breaks a rule today stands in the lists below. They only ever get shorter: an entry that is no longer needed fails.
@@ -27,37 +28,15 @@ const CROSSINGS_OF_TODAY: &[(&str, &str)] = &[];
 /// Files and functions (`file`, `file: function`) that are too long.
 const TOO_LONG_TODAY: &[&str] = &[];
 
-/// Rooms, and what they may not use.
-const APART: &[(&str, &[&str])] = &[
-    (
-        "depth",
-        &[
-            "vlm",
-            "kernels",
-            "fusion",
-            "query",
-            "model",
-            "complete",
-            "refine",
-            "classical",
-            "metrics",
-            "draw",
-            "scenes",
-            "benchmarks",
-        ],
-    ),
-    ("image", &["vlm", "kernels", "fusion", "query", "model", "complete", "refine"]),
-    ("vlm", &["depth", "fusion", "query", "model", "complete", "refine"]),
-    ("fusion", &["depth", "query", "model", "complete", "refine"]),
-    ("refine", &["vlm", "kernels", "fusion", "query", "model", "complete"]),
-    ("query", &["model", "complete", "refine"]),
-    ("model", &["complete", "refine", "supervise", "hub"]),
-    ("complete", &["supervise", "hub", "benchmarks", "scenes"]),
-    ("scenes", &["vlm", "kernels", "fusion", "query", "model", "complete", "refine", "benchmarks"]),
-    ("benchmarks", &["vlm", "kernels", "fusion", "query", "model", "complete", "refine"]),
-];
-/// All that `kernels` may use.
-const BELOW_KERNELS: &[&str] = &["kernels", "error"];
+/// What every room may use.
+const EVERYWHERE: &[&str] = &["src/error.rs", "src/files.rs"];
+/// What the rooms above `kernels` may use, too.
+const ABOVE_KERNELS: &str = "src/system.rs";
+
+/// Files outside of `src/kernels` that hold the word `unsafe` as code.
+const UNSAFE_OUTSIDE: &[&str] = &["src/vlm/checkpoint/stored.rs"];
+/// Files that allow what `src/lib.rs` forbids everywhere: itself, for `kernels`, and those.
+const ALLOW_UNSAFE: &[&str] = &["src/lib.rs", "src/vlm/checkpoint/stored.rs"];
 
 const LONGEST_FILE: usize = 400;
 const LONGEST_FUNCTION: usize = 80;
@@ -94,26 +73,93 @@ fn no_circle_of_files() {
     assert!(found.is_empty(), "circles of files:\n{}", shown.join("\n\n"));
 }
 
-/// The room of a file: its folder, or its own name where it has none.
-fn room(file: &str) -> &str {
-    let inner = file.trim_start_matches("src/");
-    inner.split('/').next().unwrap_or(inner).trim_end_matches(".rs")
+/// A row of the table of rooms.
+struct Room {
+    /// Folders, with a slash at their end, and files.
+    places: Vec<String>,
+    /// Rooms or parts of rooms, as `depth` or `vlm/layers`; `None` for all.
+    may_use: Option<Vec<String>>,
+}
+
+/// What stands in code type in a text.
+fn names(text: &str) -> Vec<String> {
+    text.split('`').skip(1).step_by(2).map(String::from).collect()
+}
+
+/// The table under "Rooms" of a text as `ARCHITECTURE.md`.
+fn rooms(text: &str) -> Vec<Room> {
+    let section = text.split("\n## ").find(|section| section.starts_with("Rooms\n")).unwrap();
+    let rows = section.lines().filter(|line| line.starts_with("| `src/"));
+    let room = |line: &str| {
+        let cells: Vec<&str> = line.split('|').collect();
+        assert_eq!(cells.len(), 5, "three columns in {line}");
+        let may_use = (cells[3].trim() != "everything").then(|| names(cells[3]));
+        Room { places: names(cells[1]), may_use }
+    };
+    rows.map(room).collect()
+}
+
+/// Whether a place of the table holds a file.
+fn holds(place: &str, file: &str) -> bool {
+    file == place || place.ends_with('/') && file.starts_with(place)
+}
+
+/// The uses that the table does not allow.
+fn crossings(graph: &Graph, rooms: &[Room]) -> BTreeSet<(String, String)> {
+    let room = |file: &str| rooms.iter().find(|room| room.places.iter().any(|place| holds(place, file)));
+    let allowed = |file: &str, used: &str| {
+        let Some(own) = room(file) else { return false };
+        let Some(may_use) = &own.may_use else { return true };
+        let named = |name: &String| {
+            let stem = format!("src/{name}");
+            used.strip_prefix(&stem).is_some_and(|rest| rest == ".rs" || rest.starts_with('/'))
+        };
+        own.places.iter().any(|place| holds(place, used))
+            || EVERYWHERE.contains(&used)
+            || used == ABOVE_KERNELS && !file.starts_with("src/kernels/")
+            || may_use.iter().any(named)
+    };
+    let pairs =
+        graph.iter().flat_map(|(file, uses)| uses.iter().map(move |used| (file.clone(), used.clone())));
+    pairs.filter(|(file, used)| !allowed(file, used)).collect()
 }
 
 #[test]
 fn arrows_between_rooms_go_one_way() {
-    let mut found = BTreeSet::new();
-    for (file, uses) in &graph_of_src() {
-        for used in uses {
-            let (from, to) = (room(file), room(used));
-            let apart = APART.iter().any(|(room, others)| *room == from && others.contains(&to));
-            if apart || from == "kernels" && !BELOW_KERNELS.contains(&to) {
-                found.insert((file.clone(), used.clone()));
-            }
-        }
+    let text = std::fs::read_to_string(package().join("ARCHITECTURE.md")).unwrap();
+    let (graph, rooms) = (graph_of_src(), rooms(&text));
+    for place in rooms.iter().flat_map(|room| &room.places) {
+        assert!(graph.keys().any(|file| holds(place, file)), "no file of src in {place}");
     }
     let known = CROSSINGS_OF_TODAY.iter().map(|(file, used)| (file.to_string(), used.to_string())).collect();
-    compare("uses against the direction of rooms", found, known);
+    compare(
+        "uses that the table of rooms in ARCHITECTURE.md does not allow",
+        crossings(&graph, &rooms),
+        known,
+    );
+}
+
+#[test]
+fn unsafe_has_one_room() {
+    let (mut found, mut allow) = (BTreeSet::new(), BTreeSet::new());
+    let mut files = Vec::new();
+    collect(&package().join("src"), &mut files);
+    for path in files {
+        let name = name_of(&path);
+        let tokens = source::tokens(&std::fs::read_to_string(&path).unwrap());
+        if !name.starts_with("src/kernels/") && tokens.iter().any(|token| token.text == "unsafe") {
+            found.insert(name.clone());
+        }
+        let attribute = |word: &[source::Token]| {
+            matches!(&word[0].text[..], "allow" | "expect") && word[2].text == "unsafe_code"
+        };
+        if tokens.windows(3).any(attribute) {
+            allow.insert(name);
+        }
+    }
+    let set = |names: &[&str]| names.iter().map(|name| name.to_string()).collect();
+    compare("files outside of kernels with `unsafe`", found, set(UNSAFE_OUTSIDE));
+    compare("files that allow unsafe code", allow, set(ALLOW_UNSAFE));
 }
 
 #[test]
@@ -124,7 +170,7 @@ fn nothing_is_too_long() {
         collect(&package().join(folder), &mut files);
     }
     for path in files {
-        let name = path.strip_prefix(package()).unwrap().display().to_string().replace('\\', "/");
+        let name = name_of(&path);
         let text = std::fs::read_to_string(&path).unwrap();
         if text.lines().count() > LONGEST_FILE {
             found.insert(name.clone());
@@ -137,6 +183,11 @@ fn nothing_is_too_long() {
     }
     let known = TOO_LONG_TODAY.iter().map(|name| name.to_string()).collect();
     compare("more than 400 lines in a file or 80 in a function", found, known);
+}
+
+/// A file as `src/depth/map.rs`.
+fn name_of(path: &Path) -> String {
+    path.strip_prefix(package()).unwrap().display().to_string().replace('\\', "/")
 }
 
 /// All Rust files of a folder.
@@ -231,5 +282,39 @@ mod rules {
         let found: Vec<_> =
             functions(&tokens(text)).into_iter().map(|f| (f.name, f.last - f.first + 1)).collect();
         assert_eq!(found, [("one".to_string(), 1), ("two".to_string(), 3)]);
+    }
+    #[test]
+    fn the_table_of_rooms_is_read() {
+        let text = "# A\n\n## Rooms\n\n| room | what | may use |\n|---|---|---|\n| `src/lib.rs` | all | everything |\n\
+                    | `src/a/`, `src/b.rs` | `Thing` | `c`, `d/low` |\n| `src/c/` | | |\n\n## Next\n\n| `src/no/` | | |\n";
+        let rooms = rooms(text);
+        assert_eq!(rooms.len(), 3);
+        let used = |file: &str, used: &str| {
+            let graph = Graph::from([(file.to_string(), BTreeSet::from([used.to_string()]))]);
+            crossings(&graph, &rooms).is_empty()
+        };
+        let good = [
+            ("a/x", "b"),
+            ("a/x", "c/y"),
+            ("b", "c"),
+            ("b", "d/low/z"),
+            ("lib", "e"),
+            ("c/y", "error"),
+            ("c/y", "system"),
+        ];
+        for (file, other) in good {
+            assert!(used(&format!("src/{file}.rs"), &format!("src/{other}.rs")), "{file} {other}");
+        }
+        // What is only named like a room, a part that is not named, what has no row.
+        for (file, other) in [
+            ("a/x", "cc"),
+            ("a/x", "d/high"),
+            ("c/y", "a/x"),
+            ("e", "c/y"),
+            ("no/n", "c/y"),
+            ("kernels/k", "system"),
+        ] {
+            assert!(!used(&format!("src/{file}.rs"), &format!("src/{other}.rs")), "{file} {other}");
+        }
     }
 }

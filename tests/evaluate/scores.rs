@@ -1,10 +1,12 @@
 //! What is scored and what the reports say.
 
+use crate::common::program::program;
 use crate::{Folder, benchmark, copies, said, succeeded, text};
+use sdim::benchmarks::Layout;
 use serde_json::{Value, json};
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::Output;
+use std::process::{Command, Output};
 
 #[test]
 fn a_checkpoint_and_all_baselines_are_scored() {
@@ -189,6 +191,12 @@ fn every_layout_is_scored() {
         ("tum", at("tum"), 2, None),
         ("scannet", at("scannet"), 3, None),
     ];
+    let scored: Vec<&str> = cases.iter().map(|case| case.0).collect();
+    for layout in Layout::ALL {
+        // The other tests score folders.
+        let name = layout.name();
+        assert!(layout == Layout::Folder || scored.contains(&name), "no case of layout {name}");
+    }
     for (case, (layout, data, frames, own)) in cases.into_iter().enumerate() {
         let own_points = own.is_some() || data.ends_with("nyu_bundle");
         let out = |kind: &str| at(&format!("out/{case}-{kind}"));
@@ -222,5 +230,16 @@ fn every_layout_is_scored() {
         let more = if own_points { &["--points", "10", "--resample"][..] } else { &["--points", "10"] };
         let table = read(benchmark(layout, &data, &out("drawn"), more));
         assert_eq!((&table["own"], &table["measured"]), (&0.into(), &10.0.into()), "{layout}");
+    }
+}
+
+#[test]
+fn the_help_names_every_layout() {
+    let out = succeeded(Command::new(program("evaluate")).arg("--help").output().unwrap());
+    let help = String::from_utf8(out.stdout).unwrap();
+    let stored = help.split("How the data set is stored: ").nth(1).unwrap().lines().next().unwrap();
+    let named: Vec<&str> = stored.split(|c: char| !c.is_alphanumeric()).collect();
+    for layout in Layout::ALL {
+        assert!(named.contains(&layout.name()), "{layout} in {stored}");
     }
 }

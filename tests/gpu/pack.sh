@@ -23,12 +23,15 @@ for line in sys.stdin:
     m = json.loads(line)
     if m.get("reason") == "build-script-executed" and "candle-kernels" in m["package_id"]: print("kernels", m["out_dir"])
     if m.get("reason") == "compiler-artifact" and m.get("executable"): print(m["target"]["name"], m["executable"])')
-checked=$(cargo test --release --features cuda --no-run $(printf -- '--test %s ' "${tests[@]}") --message-format json |
+checked=$(cargo test --release --features cuda --no-run --lib $(printf -- '--test %s ' "${tests[@]}") --message-format json |
     python3 -c '
 import json, sys
 for line in sys.stdin:
     m = json.loads(line)
-    if m.get("reason") == "compiler-artifact" and m.get("executable") and "test" in m["target"]["kind"]: print(m["target"]["name"], m["executable"])')
+    if m.get("reason") != "compiler-artifact" or not m.get("executable"): continue
+    # The unit tests are those of the library.
+    if "test" in m["target"]["kind"]: print(m["target"]["name"], m["executable"])
+    elif m["profile"]["test"]: print("lib", m["executable"])')
 whole "$(awk '$1 == "kernels" { print $2 }' <<<"$built")"
 
 stage=$(mktemp -d)
@@ -36,7 +39,7 @@ trap 'rm -rf "$stage"' EXIT
 mkdir -p "$stage/bin" "$stage/tests/fixtures" "$stage/assets" "$here/out"
 # A test and an example of one name: the test gets another one.
 for name in "${programs[@]}"; do strip -o "$stage/bin/$name" "$(awk -v n="$name" '$1 == n { print $2 }' <<<"$built")"; done
-for name in "${tests[@]}"; do strip -o "$stage/bin/test-$name" "$(awk -v n="$name" '$1 == n { print $2 }' <<<"$checked")"; done
+for name in lib "${tests[@]}"; do strip -o "$stage/bin/test-$name" "$(awk -v n="$name" '$1 == n { print $2 }' <<<"$checked")"; done
 cp -r assets/example "$stage/assets/"
 cp -r tests/fixtures/qwen_small tests/fixtures/family "$stage/tests/fixtures/"
 cp "$here/libraries.py" "$here/report.py" "$stage/"

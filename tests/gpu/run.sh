@@ -100,6 +100,8 @@ frame cuda-bf16 40 --device cuda:0 --weights bf16 --repeat 2
 compare cpu-f32 cuda-bf16
 tests golden 45 golden --skip formats --test-threads 4
 tests device 45 device --test-threads 2
+# Those unit tests of the kernels that choose their device, `on_device` in src/kernels/testing.rs, with the ones beside them.
+tests kernels 20 lib kernels::ops::norm kernels::ops::rope kernels::ops::bin_rows kernels::attention::batched
 model 3b-bf16 60 --random 3b --weights bf16 --queries 4096 --batch 2048 --rounds 3
 frame stride4-f32 15 --device cuda:0 --weights f32 --plan stride:4 --repeat 4
 frame stride4-bf16 15 --device cuda:0 --weights bf16 --plan stride:4 --repeat 4

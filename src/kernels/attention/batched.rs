@@ -207,7 +207,7 @@ mod tests {
     use super::super::composed::composed;
     use super::super::layout::Precision;
     use super::*;
-    use crate::kernels::testing::{close, random};
+    use crate::kernels::testing::{close, on_device, random};
 
     fn block(
         queries: std::ops::Range<usize>,
@@ -246,8 +246,10 @@ mod tests {
         for (layout, pair) in cases() {
             let (q, k, v) = (random(&[50, 48], 1), random(&[70, 16], 2), random(&[70, 16], 3));
             let extra = pair.then(|| (random(&[20, 16], 4), random(&[20, 16], 5)));
-            let extra = extra.as_ref().map(|(k, v)| (k, v));
-            let expected = composed(&q, &k, &v, extra, &layout).unwrap();
+            let expected = composed(&q, &k, &v, extra.as_ref().map(|(k, v)| (k, v)), &layout).unwrap();
+            let [q, k, v] = on_device([&q, &k, &v]);
+            let extra = extra.map(|(k, v)| on_device([&k, &v]));
+            let extra = extra.as_ref().map(|[k, v]| (k, v));
             close(&batched(&q, &k, &v, extra, &layout).unwrap(), &expected, 1e-5);
             let shared = extra.unwrap_or((&k, &v)).into();
             for most in [1, 200, 700, 2000] {

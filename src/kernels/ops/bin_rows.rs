@@ -72,6 +72,7 @@ fn medians(weights: &Tensor) -> Result<Tensor> {
 mod tests {
     use super::*;
     use crate::kernels::bin_stats;
+    use crate::kernels::testing::on_device;
     use candle_core::Device;
 
     #[test]
@@ -91,7 +92,7 @@ mod tests {
     fn compare(rows: &[Vec<f32>], middle: Middle, sharp: f32) {
         let bins = rows[0].len();
         let tolerance = |median: f32| (median * 0.05).max(1.0);
-        let logits = Tensor::new(rows.to_vec(), &Device::Cpu).unwrap();
+        let [logits] = on_device([&Tensor::new(rows.to_vec(), &Device::Cpu).unwrap()]);
         for (row, found) in rows.iter().zip(bin_stats_of_rows(&logits, middle, tolerance).unwrap()) {
             let (found, wanted) =
                 (found.unwrap(), bin_stats(row, &mut Vec::new(), middle, tolerance).unwrap());
@@ -112,7 +113,7 @@ mod tests {
         rows[0][33] = f32::NAN;
         rows[1][33] = f32::INFINITY;
         rows[2] = vec![f32::NEG_INFINITY; 40];
-        let logits = Tensor::new(rows, &Device::Cpu).unwrap();
+        let [logits] = on_device([&Tensor::new(rows, &Device::Cpu).unwrap()]);
         let found = bin_stats_of_rows(&logits, Middle::Median, |_| 1.0).unwrap();
         assert_eq!(found.iter().map(Option::is_some).collect::<Vec<_>>(), [false, false, false, true]);
         let none = Tensor::zeros((0, 40), DType::F32, &Device::Cpu).unwrap();

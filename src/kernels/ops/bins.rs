@@ -1,4 +1,4 @@
-//! Statistics of a distribution over equally wide bins, from its logits.
+//! Statistics of a distribution over bins, from its logits. Positions are counted in bins, whatever each bin stands for.
 
 use crate::kernels::isa::{Isa, Level, per_level};
 use crate::kernels::simd::exp;

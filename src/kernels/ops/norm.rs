@@ -23,7 +23,7 @@ pub fn rms_norm(x: &Tensor, weight: &Tensor, eps: f64) -> Result<Tensor> {
     if !on_cpu(&[x, weight]) {
         return composed(x, weight, eps);
     }
-    let op = RmsNorm { eps: eps as f32 };
+    let op = RmsNormOp { eps: eps as f32 };
     Ok(x.contiguous()?.apply_op2(&weight.contiguous()?, op)?)
 }
 
@@ -36,7 +36,8 @@ fn composed(x: &Tensor, weight: &Tensor, eps: f64) -> Result<Tensor> {
     Ok(x.broadcast_div(&(mean + eps)?.sqrt()?)?.broadcast_mul(weight)?)
 }
 
-struct RmsNorm {
+/// [`rms_norm`] on the CPU, as candle's custom operation.
+struct RmsNormOp {
     eps: f32,
 }
 
@@ -95,7 +96,7 @@ fn backward_body<S: Isa>(
 }
 per_level!(fn backward_chunk(dx: &mut [f32], dw: &mut [f32], x: &[f32], weight: &[f32], grad: &[f32], eps: f32) = backward_body);
 
-impl CustomOp2 for RmsNorm {
+impl CustomOp2 for RmsNormOp {
     fn name(&self) -> &'static str {
         "rms-norm"
     }
@@ -151,7 +152,7 @@ impl CustomOp2 for RmsNorm {
 mod tests {
     use super::*;
     use crate::kernels::testing::{
-        at_every_level, check_gradients, close, gradients, random, same_on_any_thread_count,
+        at_every_level, check_gradients, close, gradients, on_device, random, same_on_any_thread_count,
     };
 
     #[test]
@@ -167,9 +168,10 @@ mod tests {
     fn the_composed_forms_are_the_kernel() {
         let (x, w) = (random(&[70, 48], 1), random(&[48], 2));
         let expected = rms_norm(&x, &w, 1e-6).unwrap();
-        let tracked = candle_core::Var::from_tensor(&x).unwrap();
-        for form in [&x, tracked.as_tensor()] {
-            close(&composed(form, &w, 1e-6).unwrap(), &expected, 1e-5);
+        let [there, weight] = on_device([&x, &w]);
+        let tracked = candle_core::Var::from_tensor(&there).unwrap();
+        for form in [&there, tracked.as_tensor()] {
+            close(&composed(form, &weight, 1e-6).unwrap(), &expected, 1e-5);
         }
         let rows = x.narrow(0, 0, 0).unwrap();
         assert_eq!(composed(&rows, &w, 1e-6).unwrap().dims(), [0, 48]);

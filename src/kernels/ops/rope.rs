@@ -120,7 +120,7 @@ impl CustomOp1 for Rope {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::kernels::testing::{at_every_level, check_gradients, close, random};
+    use crate::kernels::testing::{at_every_level, check_gradients, close, on_device, random};
 
     #[test]
     fn forward_is_the_composed_form() {
@@ -128,9 +128,10 @@ mod tests {
             let angle = random(&[n, hd / 2], 1);
             let (cos, sin) = (angle.cos().unwrap(), angle.sin().unwrap());
             let x = random(&[n, heads * hd], 2);
-            let tracked = candle_core::Var::from_tensor(&x).unwrap();
-            for form in [&x, tracked.as_tensor()] {
-                let expected = composed(form, &cos, &sin, heads).unwrap();
+            let [there, c, s] = on_device([&x, &cos, &sin]);
+            let tracked = candle_core::Var::from_tensor(&there).unwrap();
+            for form in [&there, tracked.as_tensor()] {
+                let expected = composed(form, &c, &s, heads).unwrap();
                 at_every_level(|| close(&rope(&x, &cos, &sin, heads).unwrap(), &expected, 1e-6));
             }
         }
