@@ -36,7 +36,11 @@ fn complete_runs_on_the_bundled_pair() {
     let bundled = Path::new(env!("CARGO_MANIFEST_DIR")).join("assets/example/sparse.png");
     let sparse = sdim::SparseDepth::read(bundled, Some(sdim::DepthScale::millimetres())).unwrap();
     let changed = sparse.points().filter(|&(x, y, d)| again.get(x, y) != Some(d)).count();
-    assert_eq!(v["flagged"].as_u64(), Some(changed as u64), "measured pixels in the file, but for flagged ones");
+    assert_eq!(
+        v["flagged"].as_u64(),
+        Some(changed as u64),
+        "measured pixels in the file, but for flagged ones"
+    );
     assert!(changed * 100 <= sparse.measured(), "{changed} flagged in a clean frame");
 }
 
