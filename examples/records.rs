@@ -63,7 +63,7 @@ struct Args {
     /// Questions per variant.
     #[arg(long, default_value_t = BatchConfig::default().questions)]
     questions: usize,
-    /// Fewest and most measurements of a frame: FEWEST,MOST.
+    /// Fewest and most measurements of a frame: FEWEST,MOST. Blocks, rings and holes have their own numbers.
     #[arg(long, value_delimiter = ',', num_args = 1, default_value = "40,1500")]
     points: Vec<usize>,
     /// Which scenes: shares of procedural, furnished and streets, NAME=SHARE,...; procedural alone without it.

@@ -4,8 +4,18 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 /// Folders that documents name files in.
-const FOLDERS: [&str; 8] =
-    ["src/", "docs/", "examples/", "benches/", "tests/", "assets/", "scripts/", ".ci/"];
+const FOLDERS: [&str; 10] = [
+    "src/",
+    "docs/",
+    "examples/",
+    "benches/",
+    "tests/",
+    "assets/",
+    "scripts/",
+    ".ci/",
+    "training/",
+    "checkpoints/",
+];
 
 fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))

@@ -69,14 +69,19 @@ records() {
 
 # Renders what models are scored on, all sets at once.
 held_out() {
-    local mix points pids=() sets=()
+    local mix name points pids=() names=" " sets=()
     for mix in $held_mix; do
+        name=${mix%%=*}
+        case $names in
+        *" $name "*) name=$name${#names} ;;
+        *) sets+=("$name=1") ;;
+        esac
+        names="$names$name "
         for points in 100 500; do
-            records --mix "$mix" --out "$work/held/${mix%%=*}-$points" --held-out "$points" --count "$held" \
+            records --mix "$mix" --out "$work/held/$name-$points" --held-out "$points" --count "$held" \
                 --shard 16 --questions 1024 &
             pids+=($!)
         done
-        sets+=("${mix%=*}=1")
     done
     local all=${sets[*]}
     records --mix "${all// /,}" --out "$work/pictures" --held-out 500 --grid 4 --count 6 --shard 6 &
@@ -89,7 +94,7 @@ held_out() {
 # Trains one model; its number chooses the GPU where there are several.
 train() {
     local name=$1 number=$2 launch=("$python" -m sdim_training.train) own init
-    own=TRAIN_ARGS_$name init=INIT_$name
+    own=TRAIN_ARGS_${name//[^A-Za-z0-9_]/_} init=INIT_${name//[^A-Za-z0-9_]/_}
     set +e
     if [ "${#models[@]}" -gt 1 ]; then
         [ "${gpus:-0}" -le 1 ] || export CUDA_VISIBLE_DEVICES=$((number % gpus))

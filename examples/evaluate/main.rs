@@ -138,8 +138,9 @@ pub struct Args {
     shard: Option<Shard>,
     /// Make the report of finished runs or shards instead of running; into --out if given.
     #[arg(long, num_args = 1.., value_name = "DIR", conflicts_with_all = [
-        "data", "procedural", "furnished", "library", "layout", "depth_scale", "range", "frame_list", "points", "pattern", "resample", "score", "seed", "limit",
-        "checkpoint", "adapter", "methods", "plan", "readout", "outliers", "weights", "device", "shard", "figures", "verbose"])]
+        "data", "procedural", "furnished", "library", "layout", "depth_scale", "range", "frame_list", "points",
+        "pattern", "resample", "score", "seed", "limit", "checkpoint", "adapter", "methods", "plan", "readout",
+        "outliers", "weights", "device", "shard", "figures", "verbose"])]
     merge: Vec<PathBuf>,
     /// Draw the first frames into this folder, all methods and their errors beside each other.
     #[arg(long)]

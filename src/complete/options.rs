@@ -10,7 +10,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 /// What becomes of measured pixels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Preserve {
-    /// They keep their measurement bit for bit, with confidence 1.
+    /// They keep their measurement bit for bit, with confidence 1, but for those that [`Outliers`] leaves out.
     #[default]
     Keep,
     /// They are asked like any other pixel where the plan comes to them, with mask 1 as in the paper where the template has

@@ -10,8 +10,16 @@ pub(crate) fn prepare(device: &CudaDevice) -> Result<()> {
     // SAFETY: events order what several streams do with one tensor. Tensors of this device are allocated, used and freed on its one
     // stream, and candle refuses to use those of two devices together.
     unsafe { device.disable_event_tracking() };
-    keep_freed_memory(device).map_err(candle_core::Error::wrap)?;
+    // Cards without memory pools take and give back memory directly.
+    if device.cuda_stream().context().has_async_alloc() {
+        keep_freed_memory(device).map_err(candle_core::Error::wrap)?;
+    }
     Ok(())
+}
+
+/// Whether candle's kernels for bf16 are there for the device: they are from compute capability 8 (Ampere) on.
+pub(crate) fn multiplies_bf16(device: &CudaDevice) -> bool {
+    device.cuda_stream().context().compute_capability().is_ok_and(|(major, _)| major >= 8)
 }
 
 /// Lets the pool keep what is freed: by default all of it goes back to the driver whenever the host waits for the device, and the next

@@ -22,6 +22,8 @@ const BATCH_ROWS: usize = 2048;
 const DEVICE_BYTES: usize = 2 << 30;
 /// Rows of one decoder pass on another device, at most.
 const DEVICE_ROWS: usize = 1 << 16;
+/// Bins whose statistics are found on a device, at most: its sums over bins are a product with a square of them.
+const DEVICE_BINS: usize = 8192;
 /// Queries whose prompts are written at a time, so that memory does not grow with their number; more where one batch holds more.
 const QUERY_CHUNK: usize = 8 * BATCH_ROWS;
 
@@ -86,7 +88,9 @@ fn rows_within(model: &SdimModel, prefix: &Prefix, max_memory: Option<usize>) ->
     }
     // Scores of every head against the prefix, and their softmax, are there in full.
     let scores = 2 * t.heads * prefix.cache.len();
-    let bytes = (passing + kept + scores).max(1) * size_of::<f32>();
+    // So many values of each bin are there while its statistics are found.
+    let read = 8 * model.number_rows.dims().0;
+    let bytes = (passing + kept + scores + read).max(1) * size_of::<f32>();
     (max_memory.unwrap_or(DEVICE_BYTES) / bytes).clamp(1, DEVICE_ROWS)
 }
 
@@ -187,7 +191,7 @@ fn forced_numbers(batch: &mut Batch, readout: Readout) -> Result<Vec<Reading>> {
     let numbers = batch.model.prompts.numbers();
     if let Some(bins) = numbers.format.bins() {
         return bins.with_middle(readout, |middle| {
-            if batch.model.device.is_cpu() {
+            if batch.model.device.is_cpu() || bins.count > DEVICE_BINS {
                 return batch.of_numbers(Vec::new, |scratch, row| bins.read_middle(row, scratch, middle));
             }
             let stats = batch.of_bins(middle, |at| bins.tolerance(at))?;

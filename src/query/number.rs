@@ -103,8 +103,8 @@ impl NumberFormat {
             NumberFormat::LogBins { bins, lowest, highest } => (
                 "number.bins",
                 format!("{bins} bins from {lowest} to {highest}"),
-                (2..=100_000).contains(&bins) && lowest > 0.0 && lowest < highest && highest.is_finite(),
-                "2 to 100000 bins from a positive number to a larger one",
+                (2..=100_000).contains(&bins) && lowest >= 1e-6 && lowest < highest && highest <= 1e6,
+                "2 to 100000 bins from a number to a larger one, both within 0.000001 to 1000000",
             ),
             NumberFormat::Digits { decimals, integers } => (
                 "number.decimals",

@@ -343,7 +343,10 @@ mod tests {
     #[test]
     fn what_is_wrong_is_named() {
         type Change = fn(&mut Value);
-        let cases: [(Settings, Change, &str); 14] = [
+        let cases: [(Settings, Change, &str); 17] = [
+            (Settings::tiny(), |j| j["number"]["lowest"] = 0.0.into(), "number.bins"),
+            (Settings::tiny(), |j| j["number"]["lowest"] = 16.0.into(), "number.bins"),
+            (Settings::tiny(), |j| j["number"]["highest"] = 1e300.into(), "number.bins"),
             (Settings::paper(), |j| j["template"] = "papers".into(), "template"),
             (Settings::paper(), |j| j["preset"] = "qwen".into(), "preset"),
             (Settings::paper(), |j| j["preset"] = 7.into(), "preset"),

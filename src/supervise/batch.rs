@@ -165,7 +165,8 @@ pub(super) fn example_again(
     written(asking, &frame.rgb, &told, config.prompt_points, &asked, rng.random())
 }
 
-/// Measures a frame, which a random camera may have taken afterwards unless there is a `picture` of it. What is told may be wrong, what is asked is not.
+/// Measures a frame, which a random camera may have taken afterwards unless there is a `picture` of it. What is told may be
+/// wrong, what is asked is not.
 ///
 /// # Errors
 /// [`crate::Error::NoMeasurement`] if nothing can be measured.

@@ -79,7 +79,16 @@ impl TrainConfig {
     pub fn validate(&self, file: &str) -> Result<()> {
         let (b, o) = (&self.batch, &self.optimiser);
         let share = 0.0..=1.0;
-        let checks: [(&str, bool, String, &str); 14] = [
+        let checks: [(&str, bool, String, &str); 18] = [
+            ("batch.sensors", share.contains(&b.sensors), b.sensors.to_string(), "0 to 1"),
+            ("batch.errors", share.contains(&b.errors), b.errors.to_string(), "0 to 1"),
+            ("batch.edges", share.contains(&b.edges), b.edges.to_string(), "0 to 1"),
+            (
+                "batch.mix",
+                b.mix.check().is_ok(),
+                format!("{:?}", b.mix),
+                "shares of at least 0, one of them above it",
+            ),
             ("steps", self.steps > 0, self.steps.to_string(), "at least 1"),
             ("rate", positive(self.rate), self.rate.to_string(), "a positive number"),
             ("batch.frames", b.frames > 0, b.frames.to_string(), "at least 1"),

@@ -72,7 +72,7 @@ impl BinLossOp {
         let sign = (mean - target).signum() * self.config.l1 / scale;
 
         let blurred = |k: usize| (-0.5 * ((k as f32 + 0.5 - place) / sigma).powi(2)).exp();
-        let reach = (5.0 * sigma).ceil() as usize + 1;
+        let reach = ((5.0 * sigma).ceil() as usize).min(count) + 1;
         let middle = place as usize;
         let (from, to) = (middle.saturating_sub(reach), (middle + reach + 1).min(count));
         let mass: f32 = (from..to).map(blurred).sum();
@@ -247,7 +247,7 @@ mod tests {
     }
 
     #[test]
-    fn errors_are_counted_in_the_scale_measurement() {
+    fn errors_are_counted_in_the_scale() {
         let config = BinLoss { bins: equal(100, 100.0), blur: 0.0, blur_slope: 0.0, l1: 1.0 };
         let l1 = |value: f32, scale: f32| {
             let t = Tensor::zeros((1, 100), DType::F32, &Device::Cpu).unwrap();

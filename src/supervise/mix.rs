@@ -72,7 +72,8 @@ impl SceneMix {
     /// [`Error::Argument`] for a share below 0 or not finite, and when all are 0.
     pub fn check(&self) -> Result<()> {
         let shares = [self.procedural, self.furnished, self.streets];
-        if shares.iter().all(|s| s.is_finite() && *s >= 0.0) && shares.iter().any(|s| *s > 0.0) {
+        let sum: f32 = shares.iter().sum();
+        if shares.iter().all(|s| *s >= 0.0) && sum > 0.0 && sum.is_finite() {
             return Ok(());
         }
         Err(Error::argument("mix", format!("{self:?}"), "shares of at least 0, one of them above it"))

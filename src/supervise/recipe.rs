@@ -22,7 +22,8 @@ pub struct BatchConfig {
     pub questions: usize,
     /// Measurements in the prompt, at most.
     pub prompt_points: usize,
-    /// Fewest and most measurements per frame.
+    /// Fewest and most measurements per frame, evenly in their logarithm. A few frames have 20 to 60 of them; blocks, rings and
+    /// holes have as many as their sensor gives.
     pub points: (usize, usize),
     /// Where labels come from.
     pub labels: LabelSource,

@@ -38,15 +38,15 @@ pub enum WeightFormat {
 
 impl WeightFormat {
     /// What this machine multiplies best without losing what a published checkpoint holds: bf16 on a CPU with
-    /// instructions for it (AVX512-BF16) and on a CUDA device, f32 elsewhere. On 64-bit Arm it is f32 even with FEAT_BF16, whose speed was not measured.
+    /// instructions for it (AVX512-BF16) and on a CUDA device of compute capability 8 or more, f32 elsewhere. On 64-bit Arm it
+    /// is f32 even with FEAT_BF16, whose speed was not measured.
     pub fn native(device: &Device) -> Self {
-        match device.location() {
-            DeviceLocation::Cuda { .. } => Self::Bf16,
-            DeviceLocation::Cpu if cfg!(target_arch = "x86_64") && Level::current().multiplies_bf16() => {
-                Self::Bf16
-            }
-            DeviceLocation::Cpu | DeviceLocation::Metal { .. } => Self::F32,
-        }
+        let bf16 = match device {
+            #[cfg(feature = "cuda")]
+            Device::Cuda(device) => crate::kernels::cuda::multiplies_bf16(device),
+            device => device.is_cpu() && cfg!(target_arch = "x86_64") && Level::current().multiplies_bf16(),
+        };
+        if bf16 { Self::Bf16 } else { Self::F32 }
     }
 
     /// Whether matrices that lie there can be held in this form.
