@@ -69,11 +69,13 @@ def draw():
     machine, rows = read()
     figure, axes = pyplot.subplots(figsize=(7.2, 3.6), dpi=110)
     timed = [r for r in rows if r["seconds"]]
-    for name in dict.fromkeys(r["name"] for r in timed):
+    for number, name in enumerate(dict.fromkeys(r["name"] for r in timed)):
+        # Names of plans stand above the first checkpoint's points and below the next one's.
+        beside = (0, 7) if number % 2 == 0 else (0, -14)
         points = sorted((float(r["seconds"]), float(r["mae_m"]), r["plan"]) for r in timed if r["name"] == name)
         axes.plot(*zip(*[p[:2] for p in points]), "o-", label=name)
         for seconds, error, plan in points:
-            axes.annotate(plan, (seconds, error), textcoords="offset points", xytext=(0, 7), ha="center", fontsize=8)
+            axes.annotate(plan, (seconds, error), textcoords="offset points", xytext=beside, ha="center", fontsize=8)
     for row in rows:
         if not row["seconds"]:
             axes.axhline(float(row["mae_m"]), linestyle="--", color="grey", linewidth=1)
