@@ -12,7 +12,7 @@
 use super::SparseDepth;
 use super::interpolate::mesh::Mesh;
 use super::interpolate::rim;
-use super::pixels::{is_valid, local_colour};
+use super::pixels::{is_valid, local_colour, median};
 use crate::error::{Error, Result};
 use image::RgbImage;
 use rayon::prelude::*;
@@ -149,8 +149,8 @@ pub(crate) fn contradictions(rgb: &RgbImage, sparse: &SparseDepth) -> Result<Vec
 fn strays(sparse: &SparseDepth) -> Vec<(usize, bool)> {
     let depth = sparse.as_slice();
     let mut values: Vec<f32> = depth.iter().copied().filter(|d| is_valid(*d)).collect();
-    let (few, middle) = (values.len() / STRAYS, values.len() / 2);
-    let median = *values.select_nth_unstable_by(middle, f32::total_cmp).1;
+    let few = values.len() / STRAYS;
+    let Some(median) = median(&mut values) else { return Vec::new() };
     let mut near: Vec<f32> = values.iter().copied().filter(|d| *d * APART < median).collect();
     near.sort_unstable_by(f32::total_cmp);
     let nearest_usual = values.iter().copied().filter(|d| *d * APART >= median).fold(f32::INFINITY, f32::min);
@@ -298,12 +298,6 @@ impl<'a> Survey<'a> {
         let most = if crowd { COLOUR_IN_A_CROWD } else { COLOUR };
         most * least.sqrt().min(OTHER_COLOUR) / OTHER_COLOUR
     }
-}
-
-/// The middle value, the upper one of two; `None` of nothing.
-fn median(values: &mut [f32]) -> Option<f32> {
-    let middle = values.len() / 2;
-    (middle < values.len()).then(|| *values.select_nth_unstable_by(middle, f32::total_cmp).1)
 }
 
 #[cfg(test)]

@@ -52,3 +52,9 @@ pub(crate) fn local_colour(rgb: &RgbImage, x: usize, y: usize) -> [f32; 3] {
     let own = pixel(x, y);
     std::array::from_fn(|c| 0.5 * own[c] + 0.125 * around.iter().map(|p| p[c]).sum::<f32>())
 }
+
+/// The middle value, the upper one of two; `None` of nothing.
+pub(crate) fn median(values: &mut [f32]) -> Option<f32> {
+    let middle = values.len() / 2;
+    (middle < values.len()).then(|| *values.select_nth_unstable_by(middle, f32::total_cmp).1)
+}

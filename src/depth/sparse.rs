@@ -6,7 +6,7 @@ use ndarray::ArrayView2;
 
 use super::DepthScale;
 use super::io::{npy, png16};
-use super::pixels::{check_length, is_valid, pixel_count};
+use super::pixels::{check_length, is_valid, median, pixel_count};
 use crate::error::{Error, Result};
 
 /// Measured depth at some pixels of a frame, in metres (Z-depth), NaN where nothing was measured.
@@ -146,10 +146,7 @@ impl SparseDepth {
 
     /// The measurement in the middle of all by size, the larger of two, metres; `None` without any.
     pub fn median(&self) -> Option<f32> {
-        let mut depths: Vec<f32> = self.points().map(|(_, _, d)| d).collect();
-        let middle = depths.len() / 2;
-        let inside = middle < depths.len();
-        inside.then(|| *depths.select_nth_unstable_by(middle, f32::total_cmp).1)
+        median(&mut self.points().map(|(_, _, d)| d).collect::<Vec<_>>())
     }
 }
 

@@ -4,6 +4,7 @@
 //! learns what pictures and measurements look like rather than what the renderer makes of them. All strengths are relative to
 //! the frame (its median depth, its size), since scenes are between 0.1 m and 100 m deep.
 
+use crate::depth::pixels::median;
 use crate::error::{Error, Result};
 use image::RgbImage;
 use image::codecs::jpeg::{JpegDecoder, JpegEncoder};
@@ -151,11 +152,7 @@ impl DepthSensor {
             return Err(Error::BufferLength { what: "depth", expected: width * height, found: depth.len() });
         }
         let mut seen: Vec<f32> = depth.iter().copied().filter(|d| d.is_finite() && *d > 0.0).collect();
-        if seen.is_empty() {
-            return Ok(vec![f32::NAN; depth.len()]);
-        }
-        let middle = seen.len() / 2;
-        let median = *seen.select_nth_unstable_by(middle, f32::total_cmp).1;
+        let Some(median) = median(&mut seen) else { return Ok(vec![f32::NAN; depth.len()]) };
         let largest = seen.iter().copied().fold(median, f32::max);
         let mut out = vec![f32::NAN; depth.len()];
         let edges_count = self.edge_holes > 0.0 || self.mixed > 0.0;

@@ -79,10 +79,10 @@ impl TrainConfig {
     pub fn validate(&self, file: &str) -> Result<()> {
         let (b, o) = (&self.batch, &self.optimiser);
         let share = 0.0..=1.0;
-        let checks: [(&str, bool, String, &str); 18] = [
-            ("batch.sensors", share.contains(&b.sensors), b.sensors.to_string(), "0 to 1"),
-            ("batch.errors", share.contains(&b.errors), b.errors.to_string(), "0 to 1"),
-            ("batch.edges", share.contains(&b.edges), b.edges.to_string(), "0 to 1"),
+        if let Some((name, share)) = b.wrong_share() {
+            return Err(Error::config(file, &format!("batch.{name}"), share.to_string(), "0 to 1"));
+        }
+        let checks: [(&str, bool, String, &str); 15] = [
             (
                 "batch.mix",
                 b.mix.check().is_ok(),

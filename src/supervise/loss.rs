@@ -146,8 +146,8 @@ pub fn bins(logits: &Tensor, targets: Vec<Target>, config: BinLoss) -> Result<Lo
     if count != config.bins.count {
         return Err(Error::argument("logits of a row", count, config.bins.count.to_string()));
     }
-    let centres = (0..count).map(|k| config.bins.number(k as f32 + 0.5)).collect();
     let l1 = std::sync::Arc::new(Mutex::new(0.0));
+    let centres = config.bins.centres();
     let op = BinLossOp { config, centres, targets, gradient: Mutex::default(), l1: l1.clone() };
     let total = logits.contiguous()?.apply_op1(op)?;
     let l1 = l1.lock().map(|v| *v).unwrap_or(f32::NAN);

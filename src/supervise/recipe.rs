@@ -43,6 +43,14 @@ pub struct BatchConfig {
     pub mix: SceneMix,
 }
 
+impl BatchConfig {
+    /// Name and value of a share that does not lie within 0 to 1.
+    pub(super) fn wrong_share(&self) -> Option<(&'static str, f32)> {
+        let shares = [("sensors", self.sensors), ("errors", self.errors), ("edges", self.edges)];
+        shares.into_iter().find(|(_, share)| !(0.0..=1.0).contains(share))
+    }
+}
+
 impl Default for BatchConfig {
     fn default() -> Self {
         Self {

@@ -63,10 +63,8 @@ impl RecordConfig {
                 return Err(Error::argument(name, value, format!("1 to {most}")));
             }
         }
-        for (name, share) in [("sensors", b.sensors), ("errors", b.errors), ("edges", b.edges)] {
-            if !(0.0..=1.0).contains(&share) {
-                return Err(Error::argument(name, share.to_string(), "a share, 0 to 1"));
-            }
+        if let Some((name, share)) = b.wrong_share() {
+            return Err(Error::argument(name, share.to_string(), "a share, 0 to 1"));
         }
         for &(w, h) in &b.sizes {
             let fits = |s: usize| s > 0 && s.is_multiple_of(side) && s <= 8192;

@@ -1,8 +1,9 @@
 //! Attention on a device without kernels of ours, where no gradient is wanted: few large products, no more scores at once than fit.
 
+use super::composed::in_order;
 use super::layout::{AttentionLayout, Block};
 use crate::error::Result;
-use candle_core::{DType, Device, Tensor};
+use candle_core::{Device, Tensor};
 use std::sync::{Mutex, PoisonError};
 
 /// Scores that are held at once, at most: 512 MB, and as much again for their softmax.
@@ -57,22 +58,9 @@ fn in_pieces(
     layout: &AttentionLayout,
     most: usize,
 ) -> Result<Tensor> {
-    let (rows, width) = (q.dim(0)?, layout.heads * layout.head_dim);
-    let (mut parts, mut at) = (Vec::new(), 0);
-    let zeros = |rows: usize| Tensor::zeros((rows, width), q.dtype(), q.device());
-    for block in joined(&layout.blocks) {
-        for piece in pieces(&block, layout.heads, most) {
-            if piece.queries.start > at {
-                parts.push(zeros(piece.queries.start - at)?);
-            }
-            at = piece.queries.end;
-            parts.push(one_piece(q, own, shared, layout, &piece)?);
-        }
-    }
-    if at < rows || parts.is_empty() {
-        parts.push(zeros(rows - at)?);
-    }
-    Ok(if parts.len() == 1 { parts.swap_remove(0) } else { Tensor::cat(&parts, 0)? })
+    let joined = joined(&layout.blocks);
+    let all = joined.iter().flat_map(|block| pieces(block, layout.heads, most));
+    in_order(q, layout, all, |piece| one_piece(q, own, shared, layout, piece))
 }
 
 /// The blocks that have rows, in order; those that go on where the one before ends, with items of the same kind, as one: windows of a
@@ -197,7 +185,7 @@ fn mask(block: &Block, device: &Device) -> Result<Tensor> {
     }
     let values: Vec<f32> =
         (0..qp * kp).map(|at| if at % kp < block.seen(at / kp) { 0.0 } else { f32::NEG_INFINITY }).collect();
-    let mask = Tensor::from_vec(values, (qp, kp), device)?.to_dtype(DType::F32)?;
+    let mask = Tensor::from_vec(values, (qp, kp), device)?;
     *last = Some(mask.clone());
     Ok(mask)
 }

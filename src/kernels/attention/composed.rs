@@ -4,6 +4,7 @@ use super::layout::{AttentionLayout, Block};
 use crate::error::Result;
 
 use candle_core::{D, DType, Device, Tensor};
+use std::borrow::Borrow;
 
 /// [`attention()`](super::attention) of tensors that fit the layout, `shared` being the extra pair.
 pub(super) fn composed(
@@ -16,17 +17,29 @@ pub(super) fn composed(
     let (sk, sv) = shared.unwrap_or((k, v));
     let mut blocks: Vec<&Block> = layout.blocks.iter().filter(|b| !b.queries.is_empty()).collect();
     blocks.sort_by_key(|b| b.queries.start);
+    in_order(q, layout, blocks, |block| composed_block(q, [k, v], [sk, sv], layout, block))
+}
+
+/// What `attend` makes of each block, the blocks being in the order of their rows; rows of no block are zeros.
+pub(super) fn in_order<B: Borrow<Block>>(
+    q: &Tensor,
+    layout: &AttentionLayout,
+    blocks: impl IntoIterator<Item = B>,
+    attend: impl Fn(&Block) -> Result<Tensor>,
+) -> Result<Tensor> {
+    let (rows, width) = (q.dim(0)?, layout.heads * layout.head_dim);
+    let zeros = |rows: usize| Tensor::zeros((rows, width), q.dtype(), q.device());
     let (mut parts, mut at) = (Vec::new(), 0);
-    let zeros = |rows: usize| Tensor::zeros((rows, layout.heads * layout.head_dim), q.dtype(), q.device());
     for block in blocks {
+        let block = block.borrow();
         if block.queries.start > at {
             parts.push(zeros(block.queries.start - at)?);
         }
-        parts.push(composed_block(q, [k, v], [sk, sv], layout, block)?);
+        parts.push(attend(block)?);
         at = block.queries.end;
     }
-    if at < q.dim(0)? || parts.is_empty() {
-        parts.push(zeros(q.dim(0)? - at)?);
+    if at < rows || parts.is_empty() {
+        parts.push(zeros(rows - at)?);
     }
     Ok(Tensor::cat(&parts, 0)?)
 }
