@@ -120,7 +120,7 @@ pub use complete::{
     CancelToken, CompleteOptions, Completion, DepthCompleter, Outliers, Preserve, Progress, ProgressCallback,
     StageSeconds,
 };
-pub use depth::{DepthMap, DepthScale, Intrinsics, SparseDepth};
+pub use depth::{Camera, DepthMap, DepthScale, Distortion, Intrinsics, SparseDepth, Transform};
 pub use error::{Error, Result};
 pub use kernels::WeightFormat;
 pub use model::Adapter;

@@ -13,7 +13,7 @@ pub(crate) mod sampling;
 mod scale;
 mod sparse;
 
-pub use camera::Intrinsics;
+pub use camera::{Camera, Distortion, Intrinsics, Transform};
 pub use map::{DepthMap, Saturation};
 pub use sampling::{SparsePattern, sample_points};
 pub use scale::DepthScale;
