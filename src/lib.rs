@@ -113,7 +113,7 @@ mod supervise;
 pub mod system;
 mod vlm;
 
-pub use self::image::read_rgb;
+pub use self::image::{PixelEncoding, decode_rgb, read_rgb};
 pub use ::image::RgbImage;
 pub use candle_core::{Device, Tensor};
 pub use complete::{

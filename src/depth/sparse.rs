@@ -6,7 +6,7 @@ use ndarray::ArrayView2;
 
 use super::DepthScale;
 use super::io::{npy, png16};
-use super::pixels::{check_length, is_valid, median, pixel_count};
+use super::pixels::{check_length, is_valid, median, pixel_count, rows};
 use crate::error::{Error, Result};
 
 /// Measured depth at some pixels of a frame, in metres (Z-depth), NaN where nothing was measured.
@@ -109,19 +109,9 @@ impl SparseDepth {
         metres: impl Fn(T) -> f32,
     ) -> Result<Self> {
         let pixels = pixel_count(width, height)?;
-        if stride < width {
-            return Err(Error::argument("stride", stride, format!("at least the width, {width} elements")));
-        }
-        let needed = stride.checked_mul(height - 1).and_then(|rows| rows.checked_add(width));
-        let needed = needed.unwrap_or(usize::MAX);
-        if values.len() < needed {
-            let (what, found) = ("depth with a stride", values.len());
-            return Err(Error::BufferLength { what, expected: needed, found });
-        }
+        let rows = rows("depth", values, width, height, stride)?;
         let mut depth = Vec::with_capacity(pixels);
-        for row in values.chunks(stride).take(height) {
-            depth.extend(row.iter().take(width).map(|&v| metres(v)));
-        }
+        rows.for_each(|row| depth.extend(row.iter().map(|&v| metres(v))));
         Self::new(width, height, depth)
     }
 
