@@ -57,7 +57,8 @@
 //! | module | what |
 //! |---|---|
 //! | this one | [`DepthCompleter`]: one frame, start to end; its options, progress, cancelling; [`LoadOptions`], [`Adapter`] |
-//! | [`depth`] | sparse and dense maps, cameras, sampling patterns, files, interpolation |
+//! | [`depth`] | sparse and dense maps, cameras, clouds and depth cameras into the picture, sampling patterns, files, interpolation |
+//! | [`messages`] | structs shaped like ROS's `Image`, `CameraInfo`, `PointCloud2`, in and out |
 //! | [`classical`], [`metrics`], [`draw`] | completion without a model; errors and intervals; colours and figures |
 //! | [`refine`] | the trait `Fill`: how pixels that were not asked are filled |
 //! | [`settings`] | how a checkpoint is asked: `sdim.json` |
@@ -102,6 +103,7 @@ pub mod hub;
 mod image;
 #[allow(unsafe_code)]
 mod kernels;
+pub mod messages;
 pub mod metrics;
 mod model;
 mod query;
