@@ -164,3 +164,26 @@ fn structured_arrays_are_clouds() {
         assert_eq!(cloud.points().unwrap(), expected);
     }
 }
+
+/// The bundled frame's own depth, seen from its own camera: nothing is hidden, whatever the share of the pixels that is measured.
+#[test]
+fn what_the_camera_sees_is_kept() {
+    let (mm, example) =
+        (sdim::DepthScale::millimetres(), format!("{}/assets/example", env!("CARGO_MANIFEST_DIR")));
+    let camera = Camera::new(640, 480, Intrinsics::from_fov(640, 480, 1.1), Distortion::None).unwrap();
+    for (name, one_in, lost) in
+        [("sparse", 1, 0.0), ("gt", 613, 0.0), ("gt", 97, 0.01), ("gt", 13, 0.006), ("gt", 1, 0.002)]
+    {
+        let map = SparseDepth::read(format!("{example}/{name}.png"), Some(mm)).unwrap();
+        let some = map.points().filter(|(x, y, _)| (x * 31 + y * 17) % one_in == 0);
+        let point = |(x, y, d): (usize, usize, f32)| camera.ray(x as f32, y as f32).unwrap().map(|c| c * d);
+        let (_, report) =
+            SparseDepth::from_cloud(some.map(point), &camera, &Transform::identity(), &Default::default())
+                .unwrap();
+        assert_eq!(report.measured + report.hidden, report.points);
+        assert!(
+            report.points >= 500 && report.hidden as f64 <= lost * report.points as f64,
+            "1 in {one_in}: {report}"
+        );
+    }
+}

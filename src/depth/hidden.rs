@@ -15,8 +15,9 @@ use rayon::prelude::*;
 pub struct Visibility {
     /// How much nearer the surface must be, as a share of the point's depth: 0.05 by default. 1 or more keeps all points.
     pub margin: f32,
-    /// Reach of the window in columns and rows, pixels. `None`, the default, takes the spacing of the measurements in the picture (the
-    /// median gap along rows and along columns, 32 at most) and one more, so that the window holds the next scan line on either side.
+    /// Reach of the window in columns and rows, pixels, 128 at most. `None`, the default, takes the spacing of the measurements in the picture
+    /// (the median gap across and down) and one more, so that the window holds the next scan line on either side. Where there is
+    /// less than one measurement on 400 pixels, all are kept: so few do not tell a surface from a gap.
     pub window: Option<(usize, usize)>,
 }
 
@@ -26,13 +27,14 @@ impl Default for Visibility {
     }
 }
 
-/// Largest reach that is chosen, and the largest that is accepted.
-const REACH: usize = 32;
+/// Pixels for each measurement (the gap across times the gap down) from which on they are too few to tell a surface from a gap. LiDARs of 16
+/// lines before a picture of 1920 columns have about 120.
+const SPARSE: f32 = 400.0;
+/// Largest gap, pixels, and largest reach that is accepted.
+const REACH: usize = 64;
 const LARGEST_REACH: usize = 128;
-/// Neighbouring columns (rows) in which the next measurement above (beside) is looked for: scan lines do not meet the grid of pixels.
-const ASIDE: usize = 1;
 /// Measurements of which the gaps are taken, about.
-const SAMPLE: usize = 4096;
+const SAMPLE: usize = 1024;
 
 impl Visibility {
     /// Every point that is the nearest on its pixel.
@@ -60,7 +62,7 @@ impl Visibility {
             return 0;
         }
         let grid = Grid { depth, width, height: depth.len() / width };
-        let reach = self.window.unwrap_or_else(|| grid.reach());
+        let Some(reach) = self.window.or_else(|| grid.reach()) else { return 0 };
         let nearer = 1.0 - self.margin;
         let hidden: Vec<usize> = (0..grid.height)
             .into_par_iter()
@@ -100,31 +102,35 @@ impl Grid<'_> {
         false
     }
 
-    /// The window's reach from the spacing of the measurements.
-    fn reach(&self) -> (usize, usize) {
+    /// The window's reach from the spacing of the measurements; `None` where they lie too far apart to tell a gap from a surface.
+    fn reach(&self) -> Option<(usize, usize)> {
         let measured = self.depth.iter().filter(|d| !d.is_nan()).count();
         let every = (measured / SAMPLE).max(1);
-        let pixels = || {
-            let all = self.depth.iter().enumerate().filter(|(_, d)| !d.is_nan());
-            all.step_by(every).map(|(i, _)| (i % self.width, i / self.width))
-        };
-        let along = |gap: &dyn Fn((usize, usize)) -> usize| {
-            let mut gaps: Vec<f32> = pixels().map(|p| gap(p) as f32).collect();
-            median(&mut gaps).map_or(1, |gap| gap as usize) + 1
-        };
-        let first = |place: &dyn Fn(usize, isize) -> Option<f32>| {
-            let aside = ASIDE as isize;
-            (1..REACH).find(|&gap| (-aside..=aside).any(|a| place(gap, a).is_some())).unwrap_or(REACH)
-        };
-        let columns = along(&|(x, y)| first(&|gap, a| self.at(x + gap, y.checked_add_signed(a)?)));
-        let rows = along(&|(x, y)| first(&|gap, a| self.at(x.checked_add_signed(a)?, y + gap)));
-        (columns.min(REACH), rows.min(REACH))
+        let mut gaps = [Vec::new(), Vec::new()];
+        let all = self.depth.iter().enumerate().filter(|(_, d)| !d.is_nan());
+        for (pixel, _) in all.step_by(every) {
+            let (x, y) = (pixel % self.width, pixel / self.width);
+            let across = |gap: usize, aside: isize| self.at(x + gap, y.checked_add_signed(aside)?);
+            let down = |gap: usize, aside: isize| self.at(x.checked_add_signed(aside)?, y + gap);
+            gaps[0].push(first_gap(across));
+            gaps[1].push(first_gap(down));
+        }
+        let [across, down] = gaps.map(|mut gaps| median(&mut gaps).filter(|gap| *gap < REACH as f32));
+        let (across, down) = (across?, down?);
+        (across * down < SPARSE).then_some((across as usize + 1, down as usize + 1))
     }
 
     fn at(&self, x: usize, y: usize) -> Option<f32> {
         let inside = x < self.width && y < self.height;
         inside.then(|| self.depth[y * self.width + x]).filter(|d| !d.is_nan())
     }
+}
+
+/// Distance to the first measurement in the quarter of the plane around an axis, [`REACH`] where there is none nearer. A quarter, because scan
+/// lines do not meet the grid of pixels, and not more, because the neighbours on a scan line say nothing of the next one.
+fn first_gap(place: impl Fn(usize, isize) -> Option<f32>) -> f32 {
+    let holds = |gap: &usize| (-(*gap as isize)..=*gap as isize).any(|aside| place(*gap, aside).is_some());
+    (1..REACH).find(holds).unwrap_or(REACH) as f32
 }
 
 /// The directions seen so far, as the two outermost ones: less than half a turn lies between them.
@@ -207,10 +213,12 @@ mod tests {
             (0..200 * 100).map(|i| if at(i) { 1.0 } else { f32::NAN }).collect::<Vec<_>>()
         };
         let reach = |depth: &[f32]| Grid { depth, width: 200, height: 100 }.reach();
-        assert_eq!(reach(&grid(1, 1)), (2, 2));
-        assert_eq!(reach(&grid(2, 8)), (3, 9));
-        assert_eq!(reach(&grid(50, 50)), (REACH, REACH));
-        assert_eq!(reach(&[f32::NAN; 200]), (2, 2));
+        assert_eq!(reach(&grid(1, 1)), Some((2, 2)));
+        assert_eq!(reach(&grid(2, 8)), Some((3, 9)));
+        assert_eq!(reach(&grid(2, 40)), Some((3, 41)));
+        assert_eq!(reach(&grid(20, 20)), None);
+        assert_eq!(reach(&grid(1, 70)), None);
+        assert_eq!(reach(&[f32::NAN; 200]), None);
     }
 
     #[test]
