@@ -70,7 +70,10 @@ impl SparseDepth {
         visibility: &Visibility,
     ) -> Result<(Self, ProjectionReport)> {
         let mut view = View::new(camera)?;
-        points.into_iter().for_each(|point| view.add(cloud_to_camera.apply(point)));
+        let points: Vec<[f32; 3]> = points.into_iter().collect();
+        let places: Vec<Place> =
+            points.into_par_iter().map(|point| place(camera, cloud_to_camera.apply(point))).collect();
+        places.into_iter().for_each(|place| view.draw(place));
         view.finish(visibility)
     }
 
@@ -97,23 +100,17 @@ impl SparseDepth {
             return Err(Error::argument("depth camera", found, expected));
         }
         let mut view = View::new(colour_camera)?;
-        // Undistorting takes the time, so rows are shared out; the pixels are drawn in their order, whatever the number of threads.
-        let row = |y: usize| -> Vec<Option<[f32; 3]>> {
+        // Lenses take the time, so rows are shared out; the pixels are drawn in their order, whatever the number of threads.
+        let row = |y: usize| -> Vec<Place> {
             let line = self.as_slice()[y * width..][..width].iter().enumerate();
-            let measured = line.filter(|(_, depth)| !depth.is_nan());
-            let point = |(x, &depth): (usize, &f32)| {
-                let ray = depth_camera.ray(x as f32, y as f32)?;
-                Some(depth_to_colour.apply(ray.map(|c| c * depth)))
+            let to = |(x, &depth): (usize, &f32)| match depth_camera.ray(x as f32, y as f32) {
+                Some(ray) => place(colour_camera, depth_to_colour.apply(ray.map(|c| c * depth))),
+                None => Place::Outside,
             };
-            measured.map(point).collect()
+            line.filter(|(_, depth)| !depth.is_nan()).map(to).collect()
         };
-        let rows: Vec<Vec<Option<[f32; 3]>>> = (0..height).into_par_iter().map(row).collect();
-        for point in rows.into_iter().flatten() {
-            match point {
-                Some(point) => view.add(point),
-                None => view.unseen(),
-            }
-        }
+        let rows: Vec<Vec<Place>> = (0..height).into_par_iter().map(row).collect();
+        rows.into_iter().flatten().for_each(|place| view.draw(place));
         view.finish(visibility)
     }
 
@@ -149,6 +146,26 @@ impl SparseDepth {
     }
 }
 
+/// Where a point is seen: a pixel's index and the Z-depth, or why not.
+enum Place {
+    At(usize, f32),
+    NotFinite,
+    Behind,
+    Outside,
+}
+
+/// Where the camera sees a point in its axes.
+fn place(camera: &Camera, point: [f32; 3]) -> Place {
+    if point.iter().any(|c| !c.is_finite()) {
+        Place::NotFinite
+    } else if point[2] <= 0.0 {
+        Place::Behind
+    } else {
+        let pixel = camera.pixel(point);
+        pixel.map_or(Place::Outside, |(x, y)| Place::At(y * camera.width() + x, point[2]))
+    }
+}
+
 /// A picture that points are drawn into, the nearest on each pixel.
 struct View<'a> {
     camera: &'a Camera,
@@ -162,30 +179,20 @@ impl<'a> View<'a> {
         Ok(Self { camera, depth: vec![f32::NAN; pixels], report: ProjectionReport::default() })
     }
 
-    /// Draws a point in the camera's axes.
-    fn add(&mut self, point: [f32; 3]) {
-        self.report.points += 1;
-        if point.iter().any(|c| !c.is_finite()) {
-            self.report.not_finite += 1;
-        } else if point[2] <= 0.0 {
-            self.report.behind += 1;
-        } else if let Some((x, y)) = self.camera.pixel(point) {
-            let pixel = &mut self.depth[y * self.camera.width() + x];
-            if pixel.is_nan() {
-                self.report.measured += 1;
-            } else {
-                self.report.overdrawn += 1;
+    /// Draws a point, and counts it.
+    fn draw(&mut self, place: Place) {
+        let report = &mut self.report;
+        report.points += 1;
+        match place {
+            Place::NotFinite => report.not_finite += 1,
+            Place::Behind => report.behind += 1,
+            Place::Outside => report.outside += 1,
+            Place::At(pixel, depth) => {
+                let pixel = &mut self.depth[pixel];
+                *(if pixel.is_nan() { &mut report.measured } else { &mut report.overdrawn }) += 1;
+                *pixel = pixel.min(depth);
             }
-            *pixel = pixel.min(point[2]);
-        } else {
-            self.report.outside += 1;
         }
-    }
-
-    /// Counts a measurement without a place.
-    fn unseen(&mut self) {
-        self.report.points += 1;
-        self.report.outside += 1;
     }
 
     fn finish(mut self, visibility: &Visibility) -> Result<(SparseDepth, ProjectionReport)> {

@@ -3,6 +3,8 @@
 //! H. Malvar, L. He, R. Cutler, "High-quality linear interpolation for demosaicing of Bayer-patterned color images" (ICASSP 2004):
 //! bilinear, corrected by the curvature of the colour that the pixel has. Factors are the paper's, in sixteenths.
 
+use rayon::prelude::*;
+
 /// Where the first red pixel is: columns and rows of the same parity are red ones.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Bayer {
@@ -10,22 +12,36 @@ pub(super) struct Bayer {
     pub red_row: usize,
 }
 
-/// Appends R, G, B of every pixel. Rows have one length; at least 2x2 pixels. Beyond the border the pattern is mirrored, which keeps colours
-/// in their places.
-pub(super) fn demosaic(rows: &[&[u8]], bayer: Bayer, rgb: &mut Vec<u8>) {
+/// R, G, B of every pixel. Rows have one length; at least 2x2 pixels. Beyond the border the pattern is mirrored, which keeps colours in their
+/// places.
+pub(super) fn demosaic(rows: &[&[u8]], bayer: Bayer) -> Vec<u8> {
     let height = rows.len();
-    let width = rows.first().map_or(0, |row| row.len());
-    for y in 0..height {
+    let line = |y: usize| {
         let lines: [&[u8]; 5] = std::array::from_fn(|i| rows[mirrored(y as isize + i as isize - 2, height)]);
-        for x in 0..width {
-            let columns: [usize; 5] = std::array::from_fn(|i| mirrored(x as isize + i as isize - 2, width));
-            let at = |right: isize, down: isize| {
-                i32::from(lines[(down + 2) as usize][columns[(right + 2) as usize]])
-            };
-            let red = (x % 2 == bayer.red_column, y % 2 == bayer.red_row);
-            rgb.extend(pixel(red, at).map(|sum| ((sum + 8) >> 4).clamp(0, 255) as u8));
+        demosaic_row(lines, bayer.red_column, y % 2 == bayer.red_row)
+    };
+    let rows: Vec<Vec<u8>> = (0..height).into_par_iter().map(line).collect();
+    rows.concat()
+}
+
+/// The row in the middle of five.
+fn demosaic_row(lines: [&[u8]; 5], red_column: usize, red_row: bool) -> Vec<u8> {
+    let width = lines[2].len();
+    let column = |x: usize| -> [usize; 5] {
+        match x >= 2 && x + 2 < width {
+            true => std::array::from_fn(|i| x + i - 2),
+            false => std::array::from_fn(|i| mirrored(x as isize + i as isize - 2, width)),
         }
+    };
+    let mut rgb = Vec::with_capacity(3 * width);
+    for x in 0..width {
+        let columns = column(x);
+        let at =
+            |right: isize, down: isize| i32::from(lines[(down + 2) as usize][columns[(right + 2) as usize]]);
+        let sums = pixel((x % 2 == red_column, red_row), at);
+        rgb.extend(sums.map(|sum| ((sum + 8) >> 4).clamp(0, 255) as u8));
     }
+    rgb
 }
 
 /// R, G and B in sixteenths of a pixel in a red column, a red row, both or neither.
@@ -78,9 +94,7 @@ mod tests {
         let row = |y: usize| (0..size.0).map(|x| colour(x, y)[channel(x, y)]).collect::<Vec<u8>>();
         let raw: Vec<Vec<u8>> = (0..size.1).map(row).collect();
         let rows: Vec<&[u8]> = raw.iter().map(|r| &r[..]).collect();
-        let mut rgb = Vec::new();
-        demosaic(&rows, Bayer { red_column: red.0, red_row: red.1 }, &mut rgb);
-        rgb
+        demosaic(&rows, Bayer { red_column: red.0, red_row: red.1 })
     }
 
     #[test]

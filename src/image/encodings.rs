@@ -119,16 +119,16 @@ pub fn decode_rgb(
         return wrong_size("expected an even width: two pixels of YUV 4:2:2 share their colour");
     }
     let rows = rows("picture", data, encoding.row_bytes(width), height, step)?;
-    let mut rgb = Vec::with_capacity(pixels * 3);
-    if let Some(bayer) = encoding.bayer() {
-        let rows: Vec<&[u8]> = rows.collect();
+    let rgb = if let Some(bayer) = encoding.bayer() {
         if width < 2 || height < 2 {
             return wrong_size("expected at least 2x2 pixels of a Bayer pattern");
         }
-        demosaic(&rows, bayer, &mut rgb);
+        demosaic(&rows.collect::<Vec<_>>(), bayer)
     } else {
+        let mut rgb = Vec::with_capacity(pixels * 3);
         rows.for_each(|row| convert(row, encoding, &mut rgb));
-    }
+        rgb
+    };
     let found = rgb.len();
     let image = RgbImage::from_raw(width as u32, height as u32, rgb);
     image.ok_or(Error::BufferLength { what: "picture", expected: pixels * 3, found })
