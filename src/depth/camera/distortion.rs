@@ -326,6 +326,12 @@ mod tests {
         assert!(barrel.undistort(0.7, 0.0, limit).is_some());
         assert_eq!(barrel.undistort(0.71, 0.0, limit), None);
 
+        // Falls between u = 1 and 2 and rises again beyond, where u = 3 lands at 0.69.
+        let again = Distortion::PlumbBob([-0.5, 0.1, 0.0, 0.0, 0.0]);
+        let limit = again.limit();
+        assert!((limit - 1.0).abs() < 1e-9, "{limit}");
+        assert_eq!(again.distort(3f64.sqrt(), 0.0, limit), None);
+
         let tangential = Distortion::PlumbBob([0.0, 0.0, 0.0, 0.1, 0.0]);
         let limit = tangential.limit();
         // x' = x + 0.3 x² turns back at x = -1.67; a pole of a rational model ends it as well.
