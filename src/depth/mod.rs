@@ -1,4 +1,4 @@
-//! Depth in memory and on disk: sparse measurements, dense maps, cameras, files, interpolation.
+//! Depth in memory and on disk: sparse measurements, dense maps, cameras, files, interpolation, normals.
 //!
 //! Everywhere in this module depth is Z-depth (along the optical axis) in metres, `f32`, row-major, `width * height`
 //! values; x grows to the right, y grows downwards; a missing value is NaN in memory and 0 in integer files.
@@ -7,6 +7,7 @@ mod camera;
 pub mod interpolate;
 pub mod io;
 mod map;
+mod normals;
 pub mod outliers;
 pub(crate) mod pixels;
 pub(crate) mod sampling;
@@ -14,7 +15,9 @@ mod scale;
 mod sparse;
 
 pub use camera::{Camera, Distortion, Intrinsics, Transform};
-pub use map::{DepthMap, Saturation};
+pub use map::{DepthMap, DepthParts, Saturation};
+pub(crate) use normals::check_camera;
+pub use normals::normals;
 pub use sampling::{SparsePattern, sample_points};
 pub use scale::DepthScale;
 pub use sparse::SparseDepth;
