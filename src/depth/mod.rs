@@ -4,6 +4,8 @@
 //! values; x grows to the right, y grows downwards; a missing value is NaN in memory and 0 in integer files.
 
 mod camera;
+mod cloud;
+mod hidden;
 pub mod interpolate;
 pub mod io;
 mod map;
@@ -15,6 +17,8 @@ mod scale;
 mod sparse;
 
 pub use camera::{Camera, Distortion, Intrinsics, Transform};
+pub use cloud::ProjectionReport;
+pub use hidden::Visibility;
 pub use map::{DepthMap, DepthParts, Saturation};
 pub(crate) use normals::check_camera;
 pub use normals::normals;

@@ -27,6 +27,8 @@ pub enum Distortion {
 
 /// Radius on the plane z = 1 that no model is followed beyond: 89.99 degrees.
 const FAR: f64 = 5000.0;
+/// Largest coefficient: far above any lens, and its products can be calculated with.
+const LARGEST: f64 = 1e9;
 /// Newton steps of an inverse, at most; five are usual.
 const STEPS: usize = 60;
 /// Distance on the plane z = 1 that an inverse may be off: below a millionth of a pixel for any camera.
@@ -37,7 +39,7 @@ impl Distortion {
     /// more if the rest is 0), `equidistant` (4). No coefficients, whatever the name, is [`Distortion::None`].
     ///
     /// # Errors
-    /// [`Error::Argument`] for another name, another number of coefficients, and one that is not finite.
+    /// [`Error::Argument`] for another name, another number of coefficients, and one that is not finite or above 1e9.
     pub fn from_ros(model: &str, d: &[f64]) -> Result<Self> {
         let wrong = |expected: &str| {
             Err(Error::argument("distortion", format!("{model:?} with {} coefficients", d.len()), expected))
@@ -83,10 +85,10 @@ impl Distortion {
         }
     }
 
-    /// Fails unless all coefficients are finite.
+    /// Fails unless all coefficients are numbers that a lens can have.
     pub(super) fn check(&self) -> Result<()> {
-        match self.coefficients().iter().find(|c| !c.is_finite()) {
-            Some(c) => Err(Error::argument("distortion coefficient", c, "a finite number")),
+        match self.coefficients().iter().find(|c| c.is_nan() || c.abs() > LARGEST) {
+            Some(c) => Err(Error::argument("distortion coefficient", c, "a finite number, 1e9 at most")),
             None => Ok(()),
         }
     }
@@ -364,6 +366,7 @@ mod tests {
             ("fisheye62", &five[..]),
             ("fisheye62", &[]),
             ("plumb_bob", &[0.0, f64::NAN, 0.0, 0.0]),
+            ("plumb_bob", &[0.0, -1e10, 0.0, 0.0]),
         ] {
             assert!(matches!(Distortion::from_ros(model, d), Err(Error::Argument { .. })), "{model} {d:?}");
         }
@@ -371,7 +374,7 @@ mod tests {
 
     #[test]
     fn absurd_coefficients_give_no_point() {
-        for c in [1e300, -1e300, f64::MAX] {
+        for c in [LARGEST, -LARGEST, 1e-300] {
             for lens in [
                 Distortion::PlumbBob([c; 5]),
                 Distortion::RationalPolynomial([c; 8]),

@@ -64,8 +64,8 @@ impl Camera {
     /// [`Distortion::None`].
     ///
     /// # Errors
-    /// [`Error::ImageSize`] for an empty size or one above 2^28 pixels; [`Error::Argument`] for numbers that are not finite and focal
-    /// lengths that are not above 0 (ROS's sign of a camera without calibration).
+    /// [`Error::ImageSize`] for an empty size or one above 2^28 pixels; [`Error::Argument`] for numbers that are not finite, coefficients
+    /// above 1e9 and focal lengths that are not above 0 (ROS's sign of a camera without calibration).
     pub fn new(width: usize, height: usize, intrinsics: Intrinsics, distortion: Distortion) -> Result<Self> {
         pixel_count(width, height)?;
         let Intrinsics { fx, fy, cx, cy } = intrinsics;
