@@ -4,7 +4,10 @@
 
 mod calibrations;
 mod clouds;
+#[path = "../common/mod.rs"]
+mod common;
 mod depth;
+mod program;
 
 use serde_json::Value;
 use std::path::PathBuf;
