@@ -70,7 +70,6 @@ fn lidar(path: &Path, keyed: &Keyed) -> Result<Option<Transform>> {
     if keyed.has("Tr") {
         return motion(path, "Tr", rows(keyed.numbers("Tr")?)).map(Some);
     }
-    // The tracking benchmark leaves the colons out of some lines; its keys are otherwise those of the object benchmark.
     if !keyed.has("Tr_velo_to_cam") {
         return Ok(None);
     }

@@ -3,11 +3,12 @@
 use std::io::Read;
 use std::path::Path;
 
-use super::{EXPECTED, Element};
+use super::element::Element;
 use crate::error::{Error, Result};
 
 pub(super) const MAGIC: &[u8; 6] = b"\x93NUMPY";
 const MAX_HEADER: usize = 1 << 16;
+const EXPECTED: &str = "a .npy array of integers or floats, of shape (H, W), (1, H, W) or (H, W, 1)";
 
 /// Whether rows or columns lie together.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

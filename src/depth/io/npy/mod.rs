@@ -13,12 +13,7 @@ use std::path::Path;
 use super::raster::Raster;
 use crate::depth::pixels::{check_length, pixel_count};
 use crate::error::{Error, Result};
-use element::Element;
 use header::{Header, MAGIC, Order};
-
-/// What is read.
-pub(super) const EXPECTED: &str =
-    "a .npy array of integers or floats, of shape (H, W), (1, H, W) or (H, W, 1)";
 
 /// Reads a file: integers of 1 to 8 bytes or floats of 2, 4 or 8, in either byte order and either order of rows and columns.
 /// Axes of length 1 before or behind (height, width) are left out.
