@@ -72,7 +72,6 @@ pub(crate) fn image_error(path: &Path, error: ImageError) -> Error {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use image::Rgb;
 
     #[test]
     fn more_formats_stand_behind_their_feature() {
@@ -94,6 +93,7 @@ mod tests {
     #[cfg(feature = "formats")]
     #[test]
     fn more_formats_are_read_and_damage_is_noticed() {
+        use image::Rgb;
         let picture = RgbImage::from_fn(7, 5, |x, y| Rgb([(x * 30) as u8, (y * 40) as u8, 90]));
         let dir = tempfile::tempdir().unwrap();
         for ending in ["webp", "bmp", "tiff"] {
