@@ -258,7 +258,7 @@ mod tests {
             let at = bytes.len() as u64;
             let size = |n: usize| if long { u32::MAX } else { n as u32 }.to_le_bytes();
             let method: [u8; 2] = if deflated { [8, 0] } else { [0, 0] };
-            let mut fields = vec![[45, 0], [0, 0], method, [0, 0], [0, 33]].concat();
+            let mut fields = [[45, 0], [0, 0], method, [0, 0], [0, 33]].concat();
             fields.extend(crc.sum().to_le_bytes());
             fields.extend([size(packed.len()), size(data.len())].concat());
             fields.extend((name.len() as u16).to_le_bytes());
