@@ -2,13 +2,19 @@
 //!
 //! `cargo run --release --example complete` runs on the bundled pair; with `--rgb P --sparse P --depth-scale S` on yours.
 //! Writes dense.png (16 bit, the input's scale), dense.npy, confidence.npy (f32) and preview.png into `--out`.
+//!
+//! From a LiDAR: `--rgb P --cloud C --calib K [--extrinsic E]`. With a camera (`--calib` or `--intrinsics`) normals.png is written, too, and
+//! with `--cloud-out F` the map as points.
 
 mod common;
+#[path = "common/sensors.rs"]
+mod sensors;
 
 use anyhow::Context;
 use clap::Parser;
 use common::{load_as, load_options, rounded, stdout};
 use indicatif::{ProgressBar, ProgressStyle};
+use sdim::calibration::Calibration;
 use sdim::depth::{Saturation, interpolate};
 use sdim::draw::preview;
 use sdim::metrics::{Errors, errors};
@@ -17,18 +23,21 @@ use sdim::{
     CompleteOptions, Completion, DepthScale, Device, Outliers, QueryPlan, Readout, RgbImage, SparseDepth,
     WeightFormat, read_rgb,
 };
+use sensors::SensorArgs;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 #[derive(Parser)]
 struct Args {
-    /// RGB frame (PNG or JPEG); without it, the bundled pair.
-    #[arg(long, requires = "sparse")]
+    /// RGB frame (PNG, JPEG, WebP, BMP or TIFF); without it, the bundled pair.
+    #[arg(long, requires = "measurements")]
     rgb: Option<PathBuf>,
-    /// Sparse depth of the same size: 16-bit PNG (with --depth-scale) or .npy in metres.
-    #[arg(long, requires = "rgb")]
+    /// Sparse depth of the same size: 16-bit PNG, .npy, .npz (FILE.npz:ARRAY), TIFF or OpenEXR. Integers need --depth-scale, floats are metres.
+    #[arg(long, group = "measurements", requires = "rgb")]
     sparse: Option<PathBuf>,
+    #[command(flatten)]
+    sensors: SensorArgs,
     /// Unit of integer depth files: mm, kitti (1/256 m), tum (1/5000 m) or units per metre.
     #[arg(long, requires = "rgb")]
     depth_scale: Option<DepthScale>,
@@ -72,25 +81,26 @@ struct Args {
 
 struct Inputs {
     rgb: PathBuf,
-    sparse: PathBuf,
+    /// `None` for a cloud.
+    sparse: Option<PathBuf>,
     gt: Option<PathBuf>,
     scale: Option<DepthScale>,
 }
 
 impl Args {
     fn inputs(&self) -> Inputs {
-        match (&self.rgb, &self.sparse) {
-            (Some(rgb), Some(sparse)) => Inputs {
+        match &self.rgb {
+            Some(rgb) => Inputs {
                 rgb: rgb.clone(),
-                sparse: sparse.clone(),
+                sparse: self.sparse.clone(),
                 gt: self.gt.clone(),
                 scale: self.depth_scale,
             },
-            _ => {
+            None => {
                 let bundled = |name| Path::new(env!("CARGO_MANIFEST_DIR")).join("assets/example").join(name);
                 Inputs {
                     rgb: bundled("rgb.png"),
-                    sparse: bundled("sparse.png"),
+                    sparse: Some(bundled("sparse.png")),
                     gt: Some(bundled("gt.png")),
                     scale: Some(DepthScale::millimetres()),
                 }
@@ -116,7 +126,7 @@ fn main() -> anyhow::Result<()> {
     let options = load_options(&args.device, args.weights, args.adapter.as_deref())?;
     let device = options.device.clone();
     let completer = load_as(&args.model, &options)?;
-    let frame = inputs.read()?;
+    let frame = inputs.read(&args.sensors)?;
     let load_seconds = start.elapsed().as_secs_f64();
 
     let bar = bar()?;
@@ -139,7 +149,7 @@ fn main() -> anyhow::Result<()> {
     }
     bar.finish_and_clear();
     let run = Run { scores: frame.scores(&done)?, frame, done, device, load_seconds, first_seconds };
-    let saturation = run.write(&args.out, inputs.scale.unwrap_or(DepthScale::millimetres()))?;
+    let saturation = run.write(&args, inputs.scale.unwrap_or(DepthScale::millimetres()))?;
     let text = match args.json {
         true => run.json().to_string(),
         false => run.summary(&saturation, &args.out),
@@ -153,12 +163,14 @@ struct Frame {
     rgb: RgbImage,
     sparse: SparseDepth,
     gt: Option<SparseDepth>,
+    calibration: Option<Calibration>,
 }
 
 impl Inputs {
     /// The files; depth of another size than the picture's is an error that names its file.
-    fn read(&self) -> anyhow::Result<Frame> {
+    fn read(&self, sensors: &SensorArgs) -> anyhow::Result<Frame> {
         let rgb = read_rgb(&self.rgb)?;
+        let calibration = sensors.calibration(&rgb)?;
         let depth = |path: &Path| {
             let map = SparseDepth::read(path, self.scale)?;
             let sizes = [(map.width(), map.height()), (rgb.width() as usize, rgb.height() as usize)];
@@ -171,8 +183,12 @@ impl Inputs {
             );
             Ok(map)
         };
-        let (sparse, gt) = (depth(&self.sparse)?, self.gt.as_deref().map(depth).transpose()?);
-        Ok(Frame { rgb, sparse, gt })
+        let sparse = match &self.sparse {
+            Some(path) => depth(path)?,
+            None => sensors.sparse(calibration.as_ref())?,
+        };
+        let gt = self.gt.as_deref().map(depth).transpose()?;
+        Ok(Frame { rgb, sparse, gt, calibration })
     }
 }
 
@@ -198,7 +214,8 @@ struct Run {
 
 impl Run {
     /// Writes maps and preview.
-    fn write(&self, dir: &Path, scale: DepthScale) -> anyhow::Result<Saturation> {
+    fn write(&self, args: &Args, scale: DepthScale) -> anyhow::Result<Saturation> {
+        let dir = &args.out;
         std::fs::create_dir_all(dir).with_context(|| dir.display().to_string())?;
         let (map, frame) = (&self.done.map, &self.frame);
         let saturation = map.write_png16(dir.join("dense.png"), scale)?;
@@ -206,6 +223,9 @@ impl Run {
         map.write_confidence_npy(dir.join("confidence.npy"))?;
         let gt = frame.gt.as_ref().map(|g| g.as_slice());
         preview::write_panel(dir.join("preview.png"), &frame.rgb, &frame.sparse, map, gt)?;
+        if let Some(calibration) = &frame.calibration {
+            args.sensors.write(map, &frame.rgb, &calibration.camera, dir)?;
+        }
         Ok(saturation)
     }
 

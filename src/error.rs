@@ -78,7 +78,7 @@ pub enum Error {
         /// What was expected.
         expected: String,
     },
-    /// A key of a JSON configuration is absent or has a value that is not supported.
+    /// A key of a configuration or calibration is absent or has a value that is not supported.
     #[error("{file}: key `{key}` is {found}; expected {expected}")]
     Config {
         /// Which configuration file.

@@ -59,6 +59,7 @@
 //! | this one | [`DepthCompleter`]: one frame, start to end; its options, progress, cancelling; [`LoadOptions`], [`Adapter`] |
 //! | [`depth`] | sparse and dense maps, cameras, clouds and depth cameras into the picture, sampling patterns, files, interpolation |
 //! | [`messages`] | structs shaped like ROS's `Image`, `CameraInfo`, `PointCloud2`, in and out |
+//! | [`cloud`], [`calibration`] | point clouds from files, from maps, to files; calibrations of ROS and KITTI |
 //! | [`classical`], [`metrics`], [`draw`] | completion without a model; errors and intervals; colours and figures |
 //! | [`refine`] | the trait `Fill`: how pixels that were not asked are filled |
 //! | [`settings`] | how a checkpoint is asked: `sdim.json` |
@@ -74,6 +75,8 @@
 //! | `train` | no | what `examples/train.rs` and `examples/records.rs` are made of: scenes and the trainer; no public names yet |
 //! | `meshes` | no | the same with rooms furnished by OBJ models |
 //! | `benchmarks` | no | `benchmarks`: NYUv2, VOID, iBims-1, KITTI, DDAD, TUM, ScanNet, folders |
+//! | `formats` | no | [`read_rgb`] reads WebP, BMP and TIFF too |
+//! | `tiff`, `exr` | no | [`SparseDepth::read`] reads TIFF, OpenEXR too |
 //! | `hub` | no | `hub`: checkpoints by name; the one feature that builds C |
 //! | `cuda`, `cudnn`, `metal`, `accelerate`, `mkl` | no | candle's back ends |
 //!
@@ -91,7 +94,9 @@
 
 #[cfg(feature = "benchmarks")]
 pub mod benchmarks;
+pub mod calibration;
 pub mod classical;
+pub mod cloud;
 mod complete;
 pub mod depth;
 pub mod draw;

@@ -195,3 +195,127 @@ fn what_an_adapter_has_wrong_is_named() {
         other => panic!("{other:?}"),
     }
 }
+
+/// The factors as PEFT saves them: prefixed names, rank, alpha and variant in a file of its own.
+fn save_as_peft(adapter: &Adapter, dir: &Path, prefix: &str, config: serde_json::Value) {
+    let factors = adapter.tensors.iter().filter(|(name, _)| name.contains(".lora_"));
+    let named: std::collections::HashMap<_, _> =
+        factors.map(|(name, t)| (format!("{prefix}{name}"), t.clone())).collect();
+    candle_core::safetensors::save(&named, dir.join("adapter_model.safetensors")).unwrap();
+    std::fs::write(dir.join("adapter_config.json"), config.to_string()).unwrap();
+}
+
+fn peft_config() -> serde_json::Value {
+    serde_json::json!({
+        "peft_type": "LORA", "r": 3, "lora_alpha": 6, "use_rslora": false, "use_dora": false, "bias": "none", "rank_pattern": {},
+        "alpha_pattern": {}, "fan_in_fan_out": false, "init_lora_weights": true, "modules_to_save": null, "layer_replication": null,
+        "target_modules": "^(model.*(q_proj|down_proj)|visual.*qkv)$", "task_type": "CAUSAL_LM",
+    })
+}
+
+fn factors_alone(base: &Base) -> Adapter {
+    let settings = Settings { fusion: None, ..adapted() };
+    let mut adapter = Adapter::fresh(&base.files.parse().unwrap().config, settings, 5).unwrap();
+    disturb(&mut adapter);
+    adapter
+}
+
+#[test]
+fn an_adapter_of_peft_gives_the_answers_of_ours_and_of_merged_weights() {
+    let base = Base::new();
+    let mut adapter = factors_alone(&base);
+    let [ours, peft] = [(); 2].map(|()| tempfile::tempdir().unwrap());
+    adapter.save(ours.path()).unwrap();
+    let load = |dir: &Path| bits(&answers(base.load(Some(dir), LoraMode::Merge, WeightFormat::F32)));
+    let expected = load(ours.path());
+    assert!(expected != bits(&answers(base.load(None, LoraMode::Merge, WeightFormat::F32))));
+    // What older and newer versions of transformers call the layers.
+    save_as_peft(&adapter, peft.path(), "base_model.model.", peft_config());
+    assert!(load(peft.path()) == expected);
+    let newer = Adapter {
+        tensors: adapter
+            .tensors
+            .iter()
+            .map(|(name, t)| {
+                (
+                    name.replacen("model.", "model.language_model.", 1).replace("visual.", "model.visual."),
+                    t.clone(),
+                )
+            })
+            .collect(),
+        settings: adapter.settings.clone(),
+    };
+    save_as_peft(&newer, peft.path(), "base_model.model.", peft_config());
+    assert!(load(peft.path()) == expected);
+
+    // W + alpha / r B A, by hand.
+    let mut merged = tiny::tensors(&base.files, 11);
+    for (name, a) in adapter.tensors.iter().filter(|(name, _)| name.ends_with(".lora_A.weight")) {
+        let layer = name.strip_suffix(".lora_A.weight").unwrap();
+        let b = &adapter.tensors[&format!("{layer}.lora_B.weight")];
+        let weight = merged.get_mut(&format!("{layer}.weight")).unwrap();
+        *weight = ((b * 2.0).unwrap().matmul(a).unwrap() + &*weight).unwrap();
+    }
+    let whole = tempfile::tempdir().unwrap();
+    tiny::write(whole.path(), &base.files, &merged);
+    let whole =
+        SdimModel::load(whole.path(), &LoadOptions::default().with_weights(WeightFormat::F32)).unwrap();
+    let (merged, found) =
+        (answers(whole), answers(base.load(Some(peft.path()), LoraMode::Merge, WeightFormat::F32)));
+    let max = merged.iter().fold(0f32, |m, v| m.max(v.abs()));
+    assert!(merged.iter().zip(&found).all(|(a, b)| (a - b).abs() < 1e-4 * max));
+
+    // alpha / sqrt(r) instead: the same as another alpha.
+    let mut stabilised = peft_config();
+    stabilised["use_rslora"] = true.into();
+    save_as_peft(&adapter, peft.path(), "base_model.model.", stabilised);
+    adapter.settings.lora.as_mut().unwrap().alpha = 6.0 * 3f32.sqrt();
+    adapter.save(ours.path()).unwrap();
+    assert!(load(peft.path()) == load(ours.path()) && load(peft.path()) != expected);
+}
+
+#[test]
+fn what_cannot_be_applied_of_peft_is_named() {
+    let base = Base::new();
+    let adapter = factors_alone(&base);
+    let dir = tempfile::tempdir().unwrap();
+    let fails = || {
+        let options = LoadOptions::default().with_adapter(dir.path());
+        SdimModel::load(base.dir.path(), &options).err().expect("an error")
+    };
+    for (key, value) in [
+        ("use_dora", true.into()),
+        ("peft_type", "IA3".into()),
+        ("rank_pattern", serde_json::json!({"q_proj": 8})),
+        ("init_lora_weights", "pissa".into()),
+        ("r", 0.into()),
+        ("lora_alpha", "high".into()),
+    ] {
+        let mut config = peft_config();
+        config[key] = value;
+        save_as_peft(&adapter, dir.path(), "base_model.model.", config);
+        match fails() {
+            Error::Config { file, key: named, .. } => {
+                assert!(named == key && file.ends_with("adapter_config.json"))
+            }
+            other => panic!("{key}: {other:?}"),
+        }
+    }
+    // A layer that the model does not have, one of another rank, none at all.
+    let mut other = adapter.clone();
+    let lonely = other.tensors.pop_first().unwrap().1;
+    other.tensors.insert("model.extra.lora_A.weight".into(), lonely);
+    save_as_peft(&other, dir.path(), "base_model.model.", peft_config());
+    match fails() {
+        Error::TensorSet { unexpected, missing, .. } => {
+            assert!(unexpected.contains(&"model.extra.lora_A.weight".to_string()) || !missing.is_empty())
+        }
+        other => panic!("{other:?}"),
+    }
+    let mut rank = peft_config();
+    rank["r"] = 4.into();
+    save_as_peft(&adapter, dir.path(), "base_model.model.", rank);
+    assert!(matches!(fails(), Error::TensorSet { misshaped, .. } if !misshaped.is_empty()));
+    save_as_peft(&Adapter { tensors: Default::default(), ..adapter }, dir.path(), "", peft_config());
+    assert!(fails().to_string().contains("no factors of LoRA"));
+}

@@ -5,9 +5,11 @@ use std::path::{Path, PathBuf};
 use hdf5_reader::error::Error as Hdf5Error;
 use hdf5_reader::{Datatype, FilterRegistry, Hdf5File, OpenOptions, SliceInfo, SliceInfoElem};
 
-use super::lzf;
+use crate::depth::io::lzf;
 use crate::error::{Error, Result};
 
+/// The registered number of the filter LZF.
+const LZF: u16 = 32000;
 /// Largest array read at once, bytes: a picture of 16 megapixels in f64.
 const LARGEST_READ: usize = 1 << 27;
 
@@ -83,7 +85,7 @@ fn filters() -> FilterRegistry {
     let mut filters = FilterRegistry::new();
     let unpack = |data: &[u8]| lzf::unpack(data, LARGEST_READ);
     let damaged = || Hdf5Error::DecompressionError("damaged LZF data".to_string());
-    filters.register(lzf::FILTER, Box::new(move |_, data, _| unpack(data).ok_or_else(damaged)));
+    filters.register(LZF, Box::new(move |_, data, _| unpack(data).ok_or_else(damaged)));
     filters
 }
 

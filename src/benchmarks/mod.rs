@@ -17,7 +17,6 @@ mod hdf5;
 mod ibims;
 mod kitti;
 mod listing;
-mod lzf;
 mod mat;
 mod nyu;
 pub(crate) mod outliers;

@@ -22,6 +22,23 @@ pub struct DepthMap {
     measured: Vec<bool>,
 }
 
+/// What a [`DepthMap`] is made of, row-major, `width * height` values each, to be taken without a copy.
+#[derive(Debug, Clone)]
+pub struct DepthParts {
+    /// Width, pixels.
+    pub width: usize,
+    /// Height, pixels.
+    pub height: usize,
+    /// Depth, metres, NaN where invalid.
+    pub depth: Vec<f32>,
+    /// Confidence in 0..=1, 0 where invalid.
+    pub confidence: Vec<f32>,
+    /// Expected absolute error, metres, NaN where invalid.
+    pub expected_error: Vec<f32>,
+    /// True where the depth is a measurement, kept bit for bit.
+    pub measured: Vec<bool>,
+}
+
 /// What could not be stored exactly in an integer file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[must_use = "a saturated pixel holds a wrong depth in the file"]
@@ -113,6 +130,12 @@ impl DepthMap {
         &self.measured
     }
 
+    /// Takes the map apart, without a copy.
+    pub fn into_parts(self) -> DepthParts {
+        let Self { width, height, depth, confidence, expected_error, measured } = self;
+        DepthParts { width, height, depth, confidence, expected_error, measured }
+    }
+
     /// Depth as (rows, columns), metres, NaN where invalid.
     pub fn depth_view(&self) -> ArrayView2<'_, f32> {
         view2(&self.depth, self.width, self.height)
@@ -200,6 +223,7 @@ impl DepthMap {
 
 #[cfg(test)]
 mod tests {
+    use super::super::io::Values;
     use super::*;
 
     fn map(depth: [f32; 4], measured: [bool; 4]) -> Result<DepthMap> {
@@ -246,6 +270,17 @@ mod tests {
     }
 
     #[test]
+    fn parts_are_those_of_the_map_and_are_not_copied() {
+        let map = map([1.5, f32::NAN, 70.0, 0.3], [true, false, false, false]).unwrap();
+        let (copy, at) = (map.clone(), map.depth().as_ptr());
+        let p = map.into_parts();
+        assert_eq!(p.depth.as_ptr(), at);
+        let again =
+            DepthMap::new(p.width, p.height, p.depth, p.confidence, p.expected_error, p.measured).unwrap();
+        assert_eq!(format!("{again:?}"), format!("{copy:?}"));
+    }
+
+    #[test]
     fn kept_measurements_can_be_proven() {
         let sparse = SparseDepth::from_points(2, 2, &[(1, 0, 0.1)]).unwrap();
         let next = f32::from_bits(0.1f32.to_bits() + 1);
@@ -282,7 +317,7 @@ mod tests {
         let back = SparseDepth::read(&depth, None).unwrap();
         assert!(back.as_slice().iter().zip(map.depth()).all(|(a, b)| a.to_bits() == b.to_bits()));
         assert!(
-            matches!(npy::read_npy(&confidence).unwrap().values, npy::Values::F32(c) if c == [0.5, 0.0, 0.5, 0.5])
+            matches!(npy::read_npy(&confidence).unwrap().values, Values::Floats(c) if c == [0.5, 0.0, 0.5, 0.5])
         );
         assert!(matches!(map.write_npy(dir.path().join("no/d.npy")), Err(Error::Io { .. })));
     }

@@ -51,6 +51,13 @@ impl DepthScale {
         if stored == 0 { f32::NAN } else { f32::from(stored) / self.units_per_metre }
     }
 
+    /// As [`DepthScale::metres`], for an integer of any size; 0 and below are missing.
+    pub(crate) fn metres_of(self, stored: i64) -> f32 {
+        // For integers of 16 bits this gives the bits of the division in f32: its operands and its result have less than half
+        // of the digits of f64, so that rounding twice is rounding once.
+        if stored <= 0 { f32::NAN } else { (stored as f64 / f64::from(self.units_per_metre)) as f32 }
+    }
+
     /// Nearest storable integer for a depth in metres, and whether the depth was too large to be stored.
     ///
     /// Missing depth (NaN, 0, infinite, negative) gives 0. A valid depth never becomes 0, which would mean missing.
@@ -108,8 +115,9 @@ mod tests {
         for scale in [DepthScale::kitti(), DepthScale::millimetres(), DepthScale::tum()] {
             for stored in 1..=u16::MAX {
                 assert_eq!(scale.stored(scale.metres(stored)), (stored, false));
+                assert_eq!(scale.metres_of(stored.into()).to_bits(), scale.metres(stored).to_bits());
             }
-            assert!(scale.metres(0).is_nan());
+            assert!(scale.metres(0).is_nan() && scale.metres_of(0).is_nan() && scale.metres_of(-1).is_nan());
         }
     }
 

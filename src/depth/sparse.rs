@@ -5,7 +5,7 @@ use std::path::Path;
 use ndarray::ArrayView2;
 
 use super::DepthScale;
-use super::io::{npy, png16};
+use super::io::{self, Raster, Values};
 use super::pixels::{check_length, is_valid, median, pixel_count, rows};
 use crate::error::{Error, Result};
 
@@ -115,11 +115,19 @@ impl SparseDepth {
         Self::new(width, height, depth)
     }
 
-    /// From a file: `.png` (16-bit grey, unit given by `scale`) or `.npy` (f32 or f64 in metres, u16 in units of `scale`).
+    /// From a file. Floats are metres, integers are in units of `scale`; of integers, 0 and below mean "not measured".
+    ///
+    /// | ending | what is read |
+    /// |---|---|
+    /// | `.png` | 16-bit grey; where there is alpha, pixels with alpha 0 are not measured |
+    /// | `.npy` | integers of 1 to 8 bytes, floats of 2, 4 or 8, shape (H, W), (1, H, W) or (H, W, 1), any byte order and axis order |
+    /// | `.npz` | the same, of the only array in it, or of the one named as in `file.npz:depth` |
+    /// | `.tif`, `.tiff` | feature `tiff`: first page, one channel, integers of 16 or 32 bits, floats of 16, 32 or 64 |
+    /// | `.exr` | feature `exr`: the only channel, or the only one whose name ends in `Z` or `Depth` |
     ///
     /// # Errors
-    /// [`Error::Io`], [`Error::Format`] (also for an unknown file name extension), [`Error::Argument`] when an integer file
-    /// is read without a scale, otherwise as [`SparseDepth::new`].
+    /// [`Error::Io`], [`Error::Format`] (also for an unknown file name extension and for one whose feature is off),
+    /// [`Error::Argument`] when an integer file is read without a scale, otherwise as [`SparseDepth::new`].
     pub fn read(path: impl AsRef<Path>, scale: Option<DepthScale>) -> Result<Self> {
         let (width, height, depth) = read_metres(path.as_ref(), scale)?;
         Self::new(width, height, depth)
@@ -197,27 +205,15 @@ fn check_range(x: usize, y: usize, value: f32) -> Result<()> {
 
 /// A depth file as (width, height, metres); invalid values are left as they are for the caller to judge.
 pub(crate) fn read_metres(path: &Path, scale: Option<DepthScale>) -> Result<(usize, usize, Vec<f32>)> {
-    let extension = path.extension().and_then(|e| e.to_str()).unwrap_or("").to_ascii_lowercase();
-    match extension.as_str() {
-        "png" => {
+    let Raster { width, height, values } = io::read(path)?;
+    let depth = match values {
+        Values::Floats(depth) => depth,
+        Values::Integers(stored) => {
             let scale = need_scale(path, scale)?;
-            let (width, height, stored) = png16::read_png16(path)?;
-            Ok((width, height, stored.into_iter().map(|s| scale.metres(s)).collect()))
+            stored.into_iter().map(|s| scale.metres_of(s)).collect()
         }
-        "npy" => {
-            let npy::Npy { width, height, values } = npy::read_npy(path)?;
-            let depth = match values {
-                npy::Values::U16(stored) => {
-                    let scale = need_scale(path, scale)?;
-                    stored.into_iter().map(|s| scale.metres(s)).collect()
-                }
-                npy::Values::F32(depth) => depth,
-                npy::Values::F64(depth) => depth.into_iter().map(|d| d as f32).collect(),
-            };
-            Ok((width, height, depth))
-        }
-        _ => Err(Error::format(path, format!("file name extension {extension:?}"), "png or npy")),
-    }
+    };
+    Ok((width, height, depth))
 }
 
 fn need_scale(path: &Path, scale: Option<DepthScale>) -> Result<DepthScale> {
@@ -308,6 +304,7 @@ mod tests {
     #[test]
     fn files_of_every_kind_are_read() {
         let dir = tempfile::tempdir().unwrap();
+        use crate::depth::io::{npy, png16};
         let (png, npy) = (dir.path().join("d.PNG"), dir.path().join("d.npy"));
         png16::write_png16(&png, 3, 1, &[0, 512, 256]).unwrap();
         npy::write_npy(&npy, 3, 1, &[f32::NAN, 2.0, 1.0]).unwrap();
@@ -315,7 +312,19 @@ mod tests {
         let from_npy = SparseDepth::read(&npy, None).unwrap();
         assert_eq!(from_png.points().collect::<Vec<_>>(), from_npy.points().collect::<Vec<_>>());
         assert!(matches!(SparseDepth::read(&png, None), Err(Error::Argument { name: "depth scale", .. })));
-        assert!(matches!(SparseDepth::read(dir.path().join("d.exr"), None), Err(Error::Format { .. })));
+        assert!(matches!(SparseDepth::read(dir.path().join("d.bmp"), None), Err(Error::Format { .. })));
         assert!(matches!(SparseDepth::read(dir.path().join("none.npy"), None), Err(Error::Io { .. })));
+    }
+
+    #[test]
+    fn endings_whose_feature_is_off_name_it() {
+        for (ending, feature, on) in [
+            ("tif", "tiff", cfg!(feature = "tiff")),
+            ("TIFF", "tiff", cfg!(feature = "tiff")),
+            ("exr", "exr", cfg!(feature = "exr")),
+        ] {
+            let message = SparseDepth::read(format!("none.{ending}"), None).unwrap_err().to_string();
+            assert_eq!(message.contains(&format!("the feature `{feature}`")), !on, "{message}");
+        }
     }
 }

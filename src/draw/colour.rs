@@ -73,6 +73,24 @@ pub fn confidence_to_rgb(confidence: &[f32], width: usize, height: usize) -> Res
     paint(ColourMap::Confidence, confidence, width, height, (0.0, 1.0), |c| c)
 }
 
+/// Colours unit normals in camera coordinates, as usual: red grows to the right, green upwards, blue towards the camera, each
+/// from -1 to 1; NaN is [`INVALID`]. A wall that faces the camera is light blue.
+///
+/// # Errors
+/// [`Error::ImageSize`], [`Error::BufferLength`].
+pub fn normals_to_rgb(normals: &[[f32; 3]], width: usize, height: usize) -> Result<RgbImage> {
+    check_length("normals", normals.len(), pixel_count(width, height)?)?;
+    let colour = |&[right, down, forward]: &[f32; 3]| match right.is_nan() {
+        true => INVALID,
+        false => {
+            Rgb([right, -down, -forward].map(|c| ((c.clamp(-1.0, 1.0) * 0.5 + 0.5) * 255.0).round() as u8))
+        }
+    };
+    let pixels = normals.iter().flat_map(|normal| colour(normal).0).collect();
+    // The length was checked.
+    Ok(RgbImage::from_raw(width as u32, height as u32, pixels).unwrap_or_default())
+}
+
 /// A range that suits a depth map: its 2nd to 98th percentile, so that a few outliers do not flatten the rest. Always
 /// non-empty, `None` without a valid pixel.
 pub fn depth_range(depth: &[f32]) -> Option<(f32, f32)> {
@@ -217,5 +235,14 @@ mod tests {
         assert_eq!(depth_range(&many), Some((21.0, 981.0)));
         assert_eq!(depth_range(&[f32::NAN, 0.0]), None);
         assert!(depth_range(&[2.0]).is_some_and(|(low, high)| low < 2.0 && 2.0 < high));
+    }
+
+    #[test]
+    fn normals_have_the_usual_colours() {
+        let normals = [[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [f32::NAN; 3]];
+        let picture = normals_to_rgb(&normals, 2, 2).unwrap();
+        let colours: Vec<[u8; 3]> = picture.pixels().map(|p| p.0).collect();
+        assert_eq!(colours, [[128, 128, 255], [255, 128, 128], [128, 255, 128], INVALID.0]);
+        assert!(matches!(normals_to_rgb(&normals, 3, 2), Err(Error::BufferLength { .. })));
     }
 }

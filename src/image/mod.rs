@@ -7,19 +7,26 @@ pub mod resize;
 pub use encodings::{PixelEncoding, decode_rgb};
 
 use crate::error::{Error, Result};
-use image::{ColorType, DynamicImage, ImageDecoder, ImageError, ImageReader, RgbImage};
+use image::{ColorType, DynamicImage, ImageDecoder, ImageError, ImageFormat, ImageReader, RgbImage};
 use std::path::Path;
 
-/// Reads a PNG or JPEG as 8-bit RGB, upright: an EXIF orientation is applied, alpha is dropped, grey is spread, and of 16 bits
+const EXPECTED: &str = match cfg!(feature = "formats") {
+    true => "a complete RGB image in PNG, JPEG, WebP, BMP or TIFF",
+    false => "a complete RGB image in PNG or JPEG",
+};
+
+/// Reads a PNG or JPEG, and with the feature `formats` a WebP, BMP or TIFF (its first page), as 8-bit RGB, upright: an EXIF orientation is applied, alpha is dropped, grey is spread, and of 16 bits
 /// the upper 8 are taken, as Pillow does with colours.
 ///
 /// # Errors
-/// [`Error::Io`]; [`Error::Format`] if the file is not a complete image; [`Error::ImageSize`] over 2^28 pixels.
+/// [`Error::Io`]; [`Error::Format`] if the file is not a complete image of these formats, and for floating-point pixels, whose
+/// brightness has no fixed scale; [`Error::ImageSize`] over 2^28 pixels.
 pub fn read_rgb(path: impl AsRef<Path>) -> Result<RgbImage> {
     let path = path.as_ref();
     let reader = ImageReader::open(path).map_err(Error::io(path))?;
     let reader = reader.with_guessed_format().map_err(Error::io(path))?;
     let wrong = |e: ImageError| image_error(path, e);
+    check_format(path, reader.format())?;
     let mut decoder = reader.into_decoder().map_err(wrong)?;
     // A header of a few bytes may claim any size; memory is set aside only for what a camera could have taken.
     let (width, height) = decoder.dimensions();
@@ -27,10 +34,27 @@ pub fn read_rgb(path: impl AsRef<Path>) -> Result<RgbImage> {
     let orientation = decoder.orientation().map_err(wrong)?;
     let mut image = DynamicImage::from_decoder(decoder).map_err(wrong)?;
     image.apply_orientation(orientation);
-    Ok(match image.color() {
-        ColorType::L16 | ColorType::La16 | ColorType::Rgb16 | ColorType::Rgba16 => upper_bytes(image),
-        _ => image.into_rgb8(),
-    })
+    match image.color() {
+        ColorType::L16 | ColorType::La16 | ColorType::Rgb16 | ColorType::Rgba16 => Ok(upper_bytes(image)),
+        ColorType::Rgb32F | ColorType::Rgba32F => {
+            Err(Error::format(path, "floating-point pixels", "a picture of 8 or 16 bits"))
+        }
+        _ => Ok(image.into_rgb8()),
+    }
+}
+
+/// Refuses formats that this build does not read, and says which feature does.
+fn check_format(path: &Path, format: Option<ImageFormat>) -> Result<()> {
+    let more = match format {
+        Some(ImageFormat::WebP) => "a WebP picture",
+        Some(ImageFormat::Bmp) => "a BMP picture",
+        Some(ImageFormat::Tiff) => "a TIFF picture",
+        _ => return Ok(()),
+    };
+    if cfg!(feature = "formats") {
+        return Ok(());
+    }
+    Err(Error::format(path, more, "PNG or JPEG, or a build with the feature `formats`"))
 }
 
 /// The upper byte of each sample, where the image crate would round.
@@ -45,6 +69,55 @@ fn upper_bytes(image: DynamicImage) -> RgbImage {
 pub(crate) fn image_error(path: &Path, error: ImageError) -> Error {
     match error {
         ImageError::IoError(e) if e.kind() != std::io::ErrorKind::UnexpectedEof => Error::io(path)(e),
-        other => Error::format(path, other.to_string(), "a complete RGB image in PNG or JPEG"),
+        other => Error::format(path, other.to_string(), EXPECTED),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn more_formats_stand_behind_their_feature() {
+        let dir = tempfile::tempdir().unwrap();
+        // The first bytes are what the format is known by.
+        for (bytes, name) in [
+            (&b"RIFF\x20\0\0\0WEBPVP8L"[..], "WebP"),
+            (b"BM\x20\0\0\0\0\0\0\0", "BMP"),
+            (b"II\x2a\0\x08\0\0\0", "TIFF"),
+        ] {
+            let path = dir.path().join("picture");
+            std::fs::write(&path, bytes).unwrap();
+            let message = read_rgb(&path).unwrap_err().to_string();
+            assert!(message.contains(name), "{message}");
+            assert_eq!(message.contains("the feature `formats`"), !cfg!(feature = "formats"), "{message}");
+        }
+    }
+
+    #[cfg(feature = "formats")]
+    #[test]
+    fn more_formats_are_read_and_damage_is_noticed() {
+        use image::Rgb;
+        let picture = RgbImage::from_fn(7, 5, |x, y| Rgb([(x * 30) as u8, (y * 40) as u8, 90]));
+        let dir = tempfile::tempdir().unwrap();
+        for ending in ["webp", "bmp", "tiff"] {
+            let path = dir.path().join(format!("picture.{ending}"));
+            picture.save(&path).unwrap();
+            assert_eq!(read_rgb(&path).unwrap(), picture, "{ending}");
+            let whole = std::fs::read(&path).unwrap();
+            for at in 0..whole.len() {
+                std::fs::write(&path, &whole[..at]).unwrap();
+                let _ = read_rgb(&path)
+                    .map_err(|e| assert!(matches!(e, Error::Format { .. } | Error::ImageSize { .. }), "{e}"));
+                let mut changed = whole.clone();
+                changed[at] ^= 0xff;
+                std::fs::write(&path, &changed).unwrap();
+                let _ = read_rgb(&path);
+            }
+        }
+        let float = image::Rgb32FImage::from_pixel(2, 2, Rgb([0.5; 3]));
+        let path = dir.path().join("float.tiff");
+        float.save(&path).unwrap();
+        assert!(read_rgb(&path).unwrap_err().to_string().contains("floating-point"));
     }
 }

@@ -1,6 +1,7 @@
 //! From files to a loaded checkpoint.
 
 use super::files::{CheckpointFiles, SETTINGS, TENSORS};
+use super::peft::{self, PEFT_TENSORS};
 use super::sdim_model::SdimModel;
 use crate::error::Result;
 use crate::query::Settings;
@@ -25,7 +26,10 @@ impl SdimModel {
     }
 
     fn assemble(mut files: CheckpointFiles, mut weights: Weights, options: &LoadOptions) -> Result<Self> {
-        if let Some(adapter) = &options.adapter {
+        if let Some(adapter) = options.adapter.as_ref().filter(|adapter| peft::is_peft(adapter)) {
+            files.settings.lora = Some(peft::lora(adapter)?);
+            weights.add_file(&adapter.join(PEFT_TENSORS))?;
+        } else if let Some(adapter) = &options.adapter {
             files.settings = Settings::from_file(&adapter.join(SETTINGS))?;
             weights.add_file(&adapter.join(TENSORS))?;
         }

@@ -13,6 +13,7 @@ mod initial;
 mod load;
 mod marked;
 mod parts;
+mod peft;
 mod prefix;
 mod sdim_model;
 

@@ -17,8 +17,8 @@ macro_rules! features {
 }
 
 /// All features of the crate, and whether this build has them. A test compares the names with the manifest.
-pub const FEATURES: [(&str, bool); 11] = features![
-    "default" "tiny" "train" "benchmarks" "meshes" "hub" "cuda" "cudnn" "metal" "accelerate" "mkl"
+pub const FEATURES: [(&str, bool); 14] = features![
+    "default" "tiny" "train" "benchmarks" "meshes" "formats" "tiff" "exr" "hub" "cuda" "cudnn" "metal" "accelerate" "mkl"
 ];
 
 /// The example's program. cargo is asked once per process and example.

@@ -4,14 +4,15 @@ use std::io::Cursor;
 use std::path::Path;
 
 use image::codecs::png::{PngDecoder, PngEncoder};
-use image::{DynamicImage, ExtendedColorType, ImageEncoder};
+use image::{DynamicImage, ExtendedColorType, ImageEncoder, LumaA};
 
 use crate::depth::pixels::{check_length, pixel_count};
 use crate::error::{Error, Result};
 
-const EXPECTED: &str = "a PNG with 16-bit grey pixels";
+const EXPECTED: &str = "a PNG with 16-bit grey pixels, with or without alpha";
 
-/// Reads a file as (width, height, stored integers in row-major order).
+/// Reads a file as (width, height, stored integers in row-major order). Where there is alpha, a pixel with alpha 0 is 0, missing,
+/// and any other alpha says nothing.
 ///
 /// # Errors
 /// [`Error::Io`]; [`Error::Format`] for a file that is not a complete 16-bit grey PNG: an 8-bit one is most likely a picture of
@@ -52,6 +53,10 @@ fn decode(bytes: &[u8], path: &Path) -> Result<(usize, usize, Vec<u16>)> {
     let decoder = PngDecoder::with_limits(Cursor::new(bytes), image::Limits::default()).map_err(bad)?;
     match DynamicImage::from_decoder(decoder).map_err(bad)? {
         DynamicImage::ImageLuma16(image) => Ok((width, height, image.into_raw())),
+        DynamicImage::ImageLumaA16(image) => {
+            let grey = |&LumaA([grey, alpha]): &LumaA<u16>| if alpha == 0 { 0 } else { grey };
+            Ok((width, height, image.pixels().map(grey).collect()))
+        }
         other => Err(Error::format(path, format!("{:?} pixels", other.color()), EXPECTED)),
     }
 }
@@ -63,7 +68,7 @@ fn check_header(bytes: &[u8], path: &Path) -> Result<(usize, usize)> {
     let number =
         |at: usize| u32::from_be_bytes([head[at], head[at + 1], head[at + 2], head[at + 3]]) as usize;
     let (width, height, bits, colour) = (number(16), number(20), head[24], head[25]);
-    if (bits, colour) != (16, 0) {
+    if !matches!((bits, colour), (16, 0 | 4)) {
         let name = match colour {
             0 => "grey",
             2 => "RGB",
@@ -112,11 +117,19 @@ mod tests {
             (ExtendedColorType::Rgb8, 3, "8-bit RGB pixels"),
             (ExtendedColorType::Rgba8, 4, "8-bit RGB with alpha pixels"),
             (ExtendedColorType::Rgb16, 6, "16-bit RGB pixels"),
-            (ExtendedColorType::La16, 4, "16-bit grey with alpha pixels"),
+            (ExtendedColorType::La8, 2, "8-bit grey with alpha pixels"),
         ] {
             let message = read(&picture(colour, size)).unwrap_err().to_string();
             assert!(message.contains(name) && message.contains("test.png"), "{message}");
         }
+    }
+
+    #[test]
+    fn alpha_says_whether_a_pixel_is_there() {
+        let samples: Vec<u8> = [700u16, 65535, 800, 0, 900, 1].iter().flat_map(|s| s.to_ne_bytes()).collect();
+        let mut bytes = Vec::new();
+        PngEncoder::new(&mut bytes).write_image(&samples, 3, 1, ExtendedColorType::La16).unwrap();
+        assert_eq!(read(&bytes).unwrap(), (3, 1, vec![700, 0, 900]));
     }
 
     #[test]

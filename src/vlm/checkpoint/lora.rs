@@ -9,7 +9,7 @@ pub struct LoraConfig {
     pub rank: usize,
     /// The addition is scaled by `alpha / rank`.
     pub alpha: f32,
-    /// Last parts of the names of the layers that carry it (`q_proj`, `gate_proj`, `qkv`), as PEFT's `target_modules`.
+    /// Names of the layers that carry it, or their last parts (`q_proj`, `gate_proj`, `qkv`), as PEFT's `target_modules`.
     pub targets: Vec<String>,
 }
 
@@ -44,7 +44,9 @@ impl LoraConfig {
     }
 
     pub(crate) fn covers(&self, layer: &str) -> bool {
-        self.targets.iter().any(|t| layer.strip_suffix(t.as_str()).is_some_and(|l| l.ends_with('.')))
+        self.targets
+            .iter()
+            .any(|t| layer.strip_suffix(t.as_str()).is_some_and(|l| l.is_empty() || l.ends_with('.')))
     }
 }
 
@@ -68,6 +70,7 @@ mod tests {
         assert!(config.covers("model.layers.0.self_attn.q_proj"));
         assert!(config.covers("model.layers.0.mlp.down_proj"));
         assert!(!config.covers("model.layers.0.self_attn.xq_proj"));
+        assert!(config.covers("q_proj"));
         assert!(!config.covers("visual.blocks.0.down_proj"));
     }
 

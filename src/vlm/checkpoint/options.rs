@@ -21,7 +21,8 @@ pub struct LoadOptions {
     /// In what form its matrices are kept. On the CPU, [`WeightFormat::Bf16`] takes half the memory of
     /// [`WeightFormat::F32`] and is faster; a published checkpoint loses nothing by it, since it is stored in bf16.
     pub weights: WeightFormat,
-    /// A directory with `sdim.json` and `sdim.safetensors`, which replace or complete those of the checkpoint.
+    /// A directory with `sdim.json` and `sdim.safetensors`, which replace or complete those of the checkpoint; or one that PEFT (or
+    /// ms-swift) has saved, with `adapter_config.json` and `adapter_model.safetensors`: plain LoRA, which leaves the settings as they are.
     pub adapter: Option<PathBuf>,
     /// What becomes of the adapter's LoRA factors.
     pub lora: LoraMode,

@@ -1,13 +1,10 @@
-//! Unpacking LZF, the fast compression that h5py offers beside deflate and `hdf5-reader` does not know.
-
-/// The filter's registered number.
-pub(super) const FILTER: u16 = 32000;
+//! Unpacking LZF, the fast compression of PCD files, which h5py offers too and `hdf5-reader` does not know.
 
 /// Unpacks a whole buffer (format: Lehmann's LibLZF); `None` for damaged data and beyond `limit` bytes.
 ///
 /// A control byte below 32 announces that many bytes, and one more, as they are. Otherwise its upper three bits are a length, 7
 /// meaning that a byte with the rest follows, and its lower five bits with the next byte a distance back into the output.
-pub(super) fn unpack(mut data: &[u8], limit: usize) -> Option<Vec<u8>> {
+pub fn unpack(mut data: &[u8], limit: usize) -> Option<Vec<u8>> {
     let mut out = Vec::new();
     while let Some((&control, rest)) = data.split_first() {
         data = rest;
