@@ -16,7 +16,7 @@ use sdim::internals::supervise::{
 };
 use sdim::internals::vlm::qwen2_5::decoder::Keep;
 use sdim::internals::vlm::qwen2_5::sequences::Sequences;
-use sdim::settings::{Hint, Settings};
+use sdim::settings::{Hint, NumberFormat, NumberTokens, Settings};
 use sdim::{Error, LoadOptions, Result, WeightFormat};
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -139,7 +139,37 @@ fn a_shard_follows_from_its_seed_and_is_read_back() {
 
 #[test]
 fn what_is_read_from_a_shard_is_what_the_trainer_makes() {
-    let writer = Writer::new(|_| {});
+    is_what_the_trainer_makes(&Writer::new(|_| {}));
+}
+
+/// A vocabulary as large as a published one has ids that records have no room for; rows of number tokens have it.
+#[test]
+fn numbers_behind_a_large_vocabulary_are_told_by_their_rows() {
+    let mut writer = Writer::new(|_| {});
+    writer.files.config.text.vocab_size = 151_936;
+    let refused = config().shard(writer.asking(), &plain(), 0).map(|s| s.dims);
+    assert!(matches!(refused, Err(Error::Config { key, .. }) if key == "vocab_size"));
+    let named = config().shard(Writer::new(|_| {}).asking(), &plain(), 0).unwrap();
+    let mut writer = Writer::new(|s| s.number_tokens = NumberTokens::Rows);
+    writer.files.config.text.vocab_size = 151_936;
+    is_what_the_trainer_makes(&writer);
+    let shard = config().shard(writer.asking(), &plain(), 0).unwrap();
+    assert_eq!(shard.about.settings.number_tokens, NumberTokens::Rows);
+    let first = Writer::new(|_| {}).prompts.numbers().ids[0] as u16;
+    let rows: Vec<u16> = named.asked_id.iter().map(|id| id - first).collect();
+    assert_eq!(shard.asked_id, rows, "the bin of the hint");
+    // Who asks with the vocabulary's tokens would take them for words.
+    let other = shard.example(Writer::new(|_| {}).asking(), 0, 0);
+    assert!(matches!(other, Err(Error::Argument { name: "sdim.json", .. })));
+    let many = Writer::new(|s| {
+        s.number = NumberFormat::Bins { bins: 70_000, range: 1.0 };
+        s.number_tokens = NumberTokens::Rows;
+    });
+    let refused = config().shard(many.asking(), &plain(), 0).map(|s| s.dims);
+    assert!(matches!(refused, Err(Error::Config { key, .. }) if key == "number.bins"));
+}
+
+fn is_what_the_trainer_makes(writer: &Writer) {
     // A set of one frame with one variant, so that its example can be made beside it.
     let mut config = config();
     (config.batch.frames, config.variants) = (1, 1);

@@ -2,7 +2,7 @@
 
 use super::marker::Marker;
 use super::mode::{AnswerMode, Generation};
-use super::number::{DepthUnit, NumberFormat};
+use super::number::{DepthUnit, NumberFormat, NumberTokens};
 use super::template::PromptTemplate;
 use crate::error::{Error, Result};
 use crate::files::read_text;
@@ -81,6 +81,9 @@ pub struct Settings {
     pub glimpse: Option<usize>,
     /// How numbers are written.
     pub number: NumberFormat,
+    /// Where the tokens of numbers that are bins come from.
+    #[serde(default, skip_serializing_if = "NumberTokens::in_vocabulary")]
+    pub number_tokens: NumberTokens,
     /// What the number 1 means.
     pub unit: DepthUnit,
     /// How an answer is got.
@@ -123,6 +126,7 @@ impl Settings {
             hint: Hint::None,
             glimpse: None,
             number: NumberFormat::Digits { decimals: 3, integers: 3 },
+            number_tokens: NumberTokens::Vocabulary,
             unit: DepthUnit::Metres,
             answer_mode: AnswerMode::Digits,
             fusion: None,
@@ -173,6 +177,7 @@ impl Settings {
             hint: Hint::Linear,
             glimpse: Some(12),
             number: NumberFormat::LogBins { bins: 1000, lowest: 0.0625, highest: 16.0 },
+            number_tokens: NumberTokens::Vocabulary,
             unit: DepthUnit::FrameMedian,
             answer_mode: AnswerMode::Digits,
             fusion: Some(FusionConfig { branch: 16, high: 32, low: 16 }),
@@ -265,6 +270,7 @@ impl Settings {
         }
         self.template.validate(file)?;
         self.number.validate(file)?;
+        self.number_tokens.validate(file, self.number)?;
         self.validate_reference(file)?;
         self.validate_mode(file, &self.answer_mode)
     }

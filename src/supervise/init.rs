@@ -5,8 +5,8 @@ use super::vocabulary::byte_tokenizer;
 use crate::error::{Error, Result};
 use crate::files::{read_text, write_tensors, write_whole};
 use crate::model::{CheckpointFiles, SETTINGS, SdimModel, initial};
-use crate::query::Settings;
 use crate::query::number::Numbers;
+use crate::query::{NumberTokens, Settings};
 use crate::vlm::checkpoint::weights::Weights;
 use crate::vlm::files::{CONFIG, PREPROCESSOR, TOKENIZER};
 use candle_core::{Device, Tensor};
@@ -41,7 +41,8 @@ impl FreshFiles {
     /// # Errors
     /// [`Error::Config`] names the key whose size does not fit; [`Error::Format`] if a part cannot be written as JSON.
     pub fn of(shape: &Shape, settings: &Settings) -> Result<Self> {
-        let numbers = settings.number.bins().map_or(0, |bins| bins.count);
+        let bins = settings.number.bins().filter(|_| settings.number_tokens == NumberTokens::Vocabulary);
+        let numbers = bins.map_or(0, |bins| bins.count);
         let text = |what: &str, value: &Value| {
             serde_json::to_string_pretty(value).map_err(|e| Error::format(what, e.to_string(), "JSON"))
         };
@@ -74,7 +75,8 @@ impl FreshFiles {
     pub fn initial(&self, seed: u64) -> Result<BTreeMap<String, Tensor>> {
         let parsed = self.parse()?;
         let layers = parsed.config.text.layers;
-        let number_ids = Numbers::new(parsed.settings.number, &parsed.tokenizer)?.ids;
+        let (format, tokens) = (parsed.settings.number, parsed.settings.number_tokens);
+        let number_ids = Numbers::new(format, tokens, &parsed.tokenizer)?.ids;
         let empty = Weights::from_tensors("fresh", Default::default());
         // Building on nothing fails, but not before each tensor was asked for.
         match SdimModel::new(parsed, &empty, &Device::Cpu) {
