@@ -45,13 +45,13 @@ def read(path):
 def row(who, o):
     held = o.get("device_memory_bytes") or o["peak_rss_bytes"]
     cells = (o["vision_s"], o["prefill_s"], o["queries_s"], o["frame_s"])
-    return f"  {who:12}" + "".join(f"{s:9.4f}" for s in cells) + f"{o['queries_per_second']:12.1f}{held * 1e-9:9.2f}"
+    return f"  {who:12}" + "".join(f"{s:10.4f}" for s in cells) + f"{o['queries_per_second']:12.1f}{held * 1e-9:10.2f}"
 
 
 ours, theirs = map(read, sys.argv[1:])
 peer = next(iter(theirs.values()), {})
 print(f"torch {peer.get('torch')}, transformers {peer.get('transformers')}, {peer.get('attention')}")
-print(f"{'':14}{'vision s':>9}{'prefix s':>9}{'queries s':>9}{'frame s':>9}{'queries/s':>12}{'GB':>9}")
+print(f"{'':14}{'vision s':>10}{'prefix s':>10}{'queries s':>10}{'frame s':>10}{'queries/s':>12}{'GB':>10}")
 for key, o in ours.items():
     p = theirs.get(key)
     print(f"{key[1]} queries, {key[0]}: {o['tokens_per_query']} tokens each, {o['prompt_tokens']} in the prefix")
@@ -59,5 +59,5 @@ for key, o in ours.items():
     if p:
         print(row("PyTorch", p))
         times = [p[k] / max(o[k], 1e-9) for k in ("vision_s", "prefill_s", "queries_s", "frame_s")]
-        print("  " + f"{'ratio':12}" + "".join(f"{r:9.2f}" for r in times))
+        print("  " + f"{'ratio':12}" + "".join(f"{r:10.2f}" for r in times))
 PYTHON

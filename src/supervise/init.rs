@@ -153,4 +153,19 @@ mod tests {
         assert_eq!(marked, [files.config.ids.vision_start, files.config.ids.image]);
         assert!(files.tokenizer.vocab_size() <= files.config.text.vocab_size);
     }
+
+    #[test]
+    fn number_tokens_of_their_own_start_as_those_of_a_vocabulary() {
+        let of = |number_tokens| {
+            let files = FreshFiles::tiny(&Settings { number_tokens, ..Settings::tiny() }).unwrap();
+            (files.parse().unwrap(), files.initial(1).unwrap())
+        };
+        let ((files, named), (_, rows)) = (of(NumberTokens::Vocabulary), of(NumberTokens::Rows));
+        let first = files.tokenizer.id("<|d0|>").unwrap() as usize;
+        let table = "model.embed_tokens.weight";
+        let values = |t: &Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+        let own = &rows["sdim.number_tokens.embedding"];
+        assert_eq!(values(own), values(&named[table].narrow(0, first, 1000).unwrap()));
+        assert!(rows[table].dims()[0] < 300, "words alone: {:?}", rows[table].dims());
+    }
 }
