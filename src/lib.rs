@@ -139,7 +139,7 @@ pub mod settings {
     pub use crate::fusion::FusionConfig;
     pub use crate::query::{
         AnswerMode, DepthUnit, Generation, Hint, Marker, MarkerShape, MeasurementPrompt, NumberFormat,
-        PixelReference, PromptTemplate, Settings,
+        NumberTokens, PixelReference, PromptTemplate, Settings,
     };
     pub use crate::vlm::checkpoint::lora::{LoraConfig, LoraMode};
     pub use crate::vlm::qwen2_5::rope::RopeLayout;

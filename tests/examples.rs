@@ -3,6 +3,8 @@
 mod common;
 
 use common::program::{FEATURES, Place, program};
+use sdim::internals::supervise::FreshFiles;
+use sdim::settings::Settings;
 use serde_json::Value;
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
@@ -180,10 +182,49 @@ fn throughput_times_each_stage() {
         // 4 x 3 merged tokens of 16 pixels between 15 and 5 of text.
         assert_eq!(v["prompt_tokens"].as_u64(), Some(32));
     }
+    // One token of its own asks and answers; both ways of saying a number on one load.
+    let small =
+        ["--random", "tiny", "--layers", "2", "--width", "64", "--height", "48", "--queries", "20,40"];
+    let out =
+        run("throughput", &[&small[..], &["--numbers", "digits,bins", "--bins", "30", "--json"]].concat());
+    assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
+    let lines: Vec<Value> = out
+        .stdout
+        .split(|b| *b == b'\n')
+        .filter(|l| !l.is_empty())
+        .map(|l| serde_json::from_slice(l).unwrap())
+        .collect();
+    let told =
+        lines.iter().map(|v| (v["numbers"].as_str(), v["queries"].as_u64(), v["tokens_per_query"].as_u64()));
+    let (digits, bins) = (Some("digits"), Some("bins"));
+    let wanted = [(digits, 20, 5), (digits, 40, 5), (bins, 20, 1), (bins, 40, 1)];
+    assert_eq!(told.collect::<Vec<_>>(), wanted.map(|(n, q, t)| (n, Some(q), Some(t))));
     for bad in
         [&["--random", "9b"][..], &["--random", "tiny", "--queries", "0"], &["--model", "/nowhere"], &[]]
     {
         let out = run("throughput", bad);
+        assert!(!out.status.success() && out.stdout.is_empty(), "{bad:?}");
+    }
+}
+
+#[test]
+fn number_tokens_writes_an_adapter_that_loads() {
+    let dir = tempfile::tempdir().unwrap();
+    let (model, adapter) = (dir.path().join("base"), dir.path().join("adapter"));
+    let asking = Settings { fusion: None, glimpse: None, ..Settings::paper() };
+    FreshFiles::tiny(&asking).unwrap().write_initial(&model, 1).unwrap();
+    let made = ["--model", text(&model), "--out", text(&adapter), "--bins", "50"];
+    let out = run("number_tokens", &[&made[..], &["--pointer", "<|point|>"]].concat());
+    assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
+    assert!(String::from_utf8_lossy(&out.stdout).contains("sdim.number_tokens.embedding [50, 192]"));
+    let options = ["--model", text(&model), "--adapter", text(&adapter), "--plan", "stride:32", "--json"];
+    let out = run("complete", &[&options[..], &["--out", text(&dir.path().join("out"))]].concat());
+    assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
+    // A token that the base lacks, and another way of asking that has digits.
+    let settings = dir.path().join("paper.json");
+    std::fs::write(&settings, "{\"preset\": \"paper\"}").unwrap();
+    for bad in [&["--pointer", "<|nothing|>"][..], &["--settings", text(&settings)], &["--bins", "1"]] {
+        let out = run("number_tokens", &[&["--model", text(&model), "--out", text(&adapter)], bad].concat());
         assert!(!out.status.success() && out.stdout.is_empty(), "{bad:?}");
     }
 }

@@ -16,7 +16,7 @@ use sdim::internals::supervise::{
 };
 use sdim::internals::vlm::qwen2_5::decoder::Keep;
 use sdim::internals::vlm::qwen2_5::sequences::Sequences;
-use sdim::settings::{Hint, Settings};
+use sdim::settings::{Hint, NumberTokens, Settings};
 use sdim::{Error, LoadOptions, Result, WeightFormat};
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -139,7 +139,26 @@ fn a_shard_follows_from_its_seed_and_is_read_back() {
 
 #[test]
 fn what_is_read_from_a_shard_is_what_the_trainer_makes() {
+    is_what_the_trainer_makes(&Writer::new(|_| {}));
+}
+
+/// A vocabulary as large as a published one has ids that records have no room for; rows of number tokens have it.
+#[test]
+fn numbers_behind_a_large_vocabulary_are_told_by_their_rows() {
+    let (mut large, mut rows) = (Writer::new(|_| {}), Writer::new(|s| s.number_tokens = NumberTokens::Rows));
+    large.files.config.text.vocab_size = 151_936;
+    rows.files.config.text.vocab_size = 151_936;
+    let refused = config().shard(large.asking(), &plain(), 0).map(|s| s.dims);
+    assert!(matches!(refused, Err(Error::Config { key, .. }) if key == "vocab_size"));
+    is_what_the_trainer_makes(&rows);
     let writer = Writer::new(|_| {});
+    let [named, shard] = [&writer, &rows].map(|w| config().shard(w.asking(), &plain(), 0).unwrap());
+    let first = writer.prompts.numbers().ids[0] as u16;
+    let bins: Vec<u16> = named.asked_id.iter().map(|id| id - first).collect();
+    assert_eq!(shard.asked_id, bins);
+}
+
+fn is_what_the_trainer_makes(writer: &Writer) {
     // A set of one frame with one variant, so that its example can be made beside it.
     let mut config = config();
     (config.batch.frames, config.variants) = (1, 1);
@@ -156,8 +175,7 @@ fn what_is_read_from_a_shard_is_what_the_trainer_makes() {
     let (made, read) = (found.unwrap().unwrap(), shard.example(writer.asking(), 0, 0).unwrap());
     assert_eq!(read.prefix, made.prefix, "ids, positions and crops of the prompt");
     assert_eq!((read.scattered, read.unit), (made.scattered, made.unit));
-    assert_eq!(read.pixels.resized, made.pixels.resized);
-    assert_eq!(read.pixels.grid, made.pixels.grid);
+    assert_eq!((read.pixels.resized, read.pixels.grid), (made.pixels.resized, made.pixels.grid));
     assert_eq!(read.items.len(), 9);
     for (read, made) in read.items.iter().zip(&made.items) {
         assert_eq!(read.tokens, made.tokens);

@@ -42,18 +42,19 @@ impl<'a> Cost<'a> {
         2.0 * n * (whole + 2.0 * width * kv)
     }
 
-    /// One query against a prefix; of the last layer only the token that is read is counted in full.
-    pub fn query(&self, prefix: usize, suffix: usize, digits: usize) -> f64 {
+    /// One query against a prefix, answered in so many passes that each multiply so many rows of the head; of the last layer only the token
+    /// that is read is counted in full.
+    pub fn query(&self, prefix: usize, suffix: usize, passes: usize, head: usize) -> f64 {
         let t = &self.config.text;
         let (width, kv) = (t.hidden_size as f64, (t.kv_heads * t.head_dim()) as f64);
         let mut total = 0.0;
-        for pass in 0..digits {
+        for pass in 0..passes {
             let (rows, before) = if pass == 0 { (suffix, 0) } else { (1, suffix + pass - 1) };
             let seen = prefix as f64 + before as f64 + (rows as f64 + 1.0) / 2.0;
             let one = self.layer() + 2.0 * width * seen;
             let rows = rows as f64;
             total += (t.layers as f64 - 1.0) * rows * one + one + (rows - 1.0) * 2.0 * width * kv;
-            total += 11.0 * width;
+            total += head as f64 * width;
         }
         2.0 * total
     }

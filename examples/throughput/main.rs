@@ -2,11 +2,14 @@
 //!
 //! ```text
 //! cargo run --release --example throughput -- --random 3b --queries 64 --suffix-tokens 1 --digits 5
+//! cargo run --release --example throughput -- --random 3b --queries 64 --numbers bins
 //! ```
 
+mod answers;
 mod cost;
 mod shapes;
 
+use answers::{Answers, Numbers};
 use anyhow::{Context as _, bail};
 use candle_core::{Device, Tensor};
 use clap::Parser;
@@ -42,15 +45,24 @@ struct Args {
     /// Height of the image as the encoder sees it, pixels; rounded up to whole merged patches.
     #[arg(long, default_value_t = 476)]
     height: usize,
-    /// Pixel queries.
-    #[arg(long, default_value_t = 64)]
-    queries: usize,
+    /// Pixel queries; several numbers are asked one after the other.
+    #[arg(long, default_value = "64", value_delimiter = ',')]
+    queries: Vec<usize>,
     /// Tokens of a query before its answer.
     #[arg(long, default_value_t = 1)]
     suffix_tokens: usize,
-    /// Tokens of an answer.
+    /// How a number is said: as `digits`, a token each, or as one token of `bins`, rows behind the vocabulary; both one after the other.
+    #[arg(long, default_value = "digits", value_delimiter = ',')]
+    numbers: Vec<Numbers>,
+    /// Tokens of an answer in digits.
     #[arg(long, default_value_t = 5)]
     digits: usize,
+    /// Number tokens, where numbers are bins.
+    #[arg(long, default_value_t = 1000)]
+    bins: usize,
+    /// Decoder layers of random weights, if not all of the shapes': a model that fits into less memory.
+    #[arg(long, requires = "random")]
+    layers: Option<usize>,
     /// Queries of one batch.
     #[arg(long, default_value_t = 512)]
     batch: usize,
@@ -70,7 +82,7 @@ struct Args {
 
 impl Args {
     fn config(&self) -> anyhow::Result<VlmConfig> {
-        let (name, json) = match (&self.model, &self.random) {
+        let (name, mut json): (String, serde_json::Value) = match (&self.model, &self.random) {
             (Some(dir), _) => {
                 let path = dir.join("config.json");
                 let text = std::fs::read(&path).with_context(|| path.display().to_string())?;
@@ -82,15 +94,24 @@ impl Args {
             },
             (None, None) => bail!("--model or --random"),
         };
+        if let Some(layers) = self.layers {
+            json["num_hidden_layers"] = layers.into();
+        }
         Ok(VlmConfig::from_json(&name, &json)?)
     }
 
+    /// The model, with number tokens behind its vocabulary if they are asked for.
     fn load(&self, config: VlmConfig, device: &Device) -> anyhow::Result<QwenVl> {
         let weights = match &self.model {
             Some(dir) => Weights::from_dir(Path::new(dir), device)?,
             None => Weights::made(shapes::random, device),
         };
-        Ok(QwenVl::new(config, &weights.with_format(self.weights), RopeLayout::Contiguous)?)
+        let mut model = QwenVl::new(config, &weights.with_format(self.weights), RopeLayout::Contiguous)?;
+        if self.numbers.contains(&Numbers::Bins) {
+            let made = Weights::made(shapes::random, device).with_format(self.weights);
+            model.decoder.add_tokens(&made, "sdim.number_tokens", self.bins)?;
+        }
+        Ok(model)
     }
 }
 
@@ -116,13 +137,27 @@ impl Stage {
 const BEFORE: usize = 15;
 const AFTER: usize = 5;
 
-struct Run {
+struct Run<'a> {
+    args: &'a Args,
+    cost: cost::Cost<'a>,
     model: QwenVl,
     device: Device,
     grid: Grid,
 }
 
-impl Run {
+/// What is asked of one image, and how long each stage took at best.
+struct Measured {
+    numbers: Numbers,
+    queries: usize,
+    /// Passes of the decoder for one answer.
+    passes: usize,
+    /// Tokens of the shared prefix.
+    prompt: usize,
+    /// Vision, prefix, queries.
+    stages: [Stage; 3],
+}
+
+impl Run<'_> {
     fn patches(&self) -> anyhow::Result<Tensor> {
         let shape = (self.grid.patches(), self.model.config.vision.patch_len());
         Ok(Tensor::randn(0f32, 1.0, shape, &self.device)?)
@@ -146,40 +181,66 @@ impl Run {
         Ok((cache, walked.next))
     }
 
-    /// Asks `args.queries` times, `args.batch` at once, and reads `args.digits` tokens greedily: all of them, step after step.
-    fn ask(&self, prefix: &KvCache, next: f32, args: &Args) -> anyhow::Result<Vec<u32>> {
-        let decoder = &self.model.decoder;
-        let number_ids: Vec<u32> = (13..24).collect();
-        let rows = decoder.head_rows(&number_ids)?;
-        let (mut left, mut read) = (args.queries, Vec::new());
+    /// Asks so many times, a batch at once, and reads all answers.
+    fn ask(
+        &self,
+        prefix: &KvCache,
+        next: f32,
+        answers: &Answers,
+        queries: usize,
+    ) -> anyhow::Result<Vec<u32>> {
+        let (decoder, suffix) = (&self.model.decoder, self.args.suffix_tokens);
+        let (mut left, mut read) = (queries, Vec::new());
         while left > 0 {
-            let items = left.min(args.batch.max(1));
+            let items = left.min(self.args.batch.max(1));
             left -= items;
-            let mut ids: Vec<u32> = (0..items * args.suffix_tokens).map(|i| 11 + (i % 13) as u32).collect();
-            let text =
-                (0..items).flat_map(|_| (0..args.suffix_tokens).map(|i| Position::text(next + i as f32)));
-            let after = vec![next + args.suffix_tokens as f32; items];
+            let ids: Vec<u32> = (0..items * suffix).map(|i| answers.asking(i)).collect();
+            let text = (0..items).flat_map(|_| (0..suffix).map(|i| Position::text(next + i as f32)));
+            let after = vec![next + suffix as f32; items];
             let (embedded, text) = (decoder.embed(&ids)?, text.collect::<Vec<_>>());
             let mut sequences = Sequences::prefill(decoder, Some(prefix), &embedded, &text, after)?;
-            for digit in 0..args.digits {
-                if digit > 0 {
-                    sequences.decode_step(&ids)?;
-                }
-                let logits = kernels::linear(sequences.last(), &rows, None)?;
-                let best = logits.argmax(1)?.to_vec1::<u32>()?;
-                ids = best.into_iter().map(|i| number_ids[i as usize]).collect();
-                read.extend_from_slice(&ids);
-            }
+            answers.read(&mut sequences, &mut read)?;
         }
         Ok(read)
+    }
+
+    /// All stages, `args.rounds` times.
+    fn measure(&self, numbers: Numbers, queries: usize) -> anyhow::Result<Measured> {
+        let answers = match numbers {
+            Numbers::Digits => Answers::digits(&self.model, self.args.digits, self.args.weights)?,
+            Numbers::Bins => Answers::bins(&self.model, self.args.bins, self.args.weights)?,
+        };
+        let (passes, rows) = (answers.passes(), answers.rows());
+        let mut best: Option<([Stage; 3], usize)> = None;
+        let patches = self.patches()?;
+        let mut first: Option<Vec<u32>> = None;
+        for round in 1..=self.args.rounds {
+            let (image, vision) = Stage::time(self.cost.vision(), || self.encode(&patches))?;
+            let prompt = BEFORE + image.dim(0)? + AFTER;
+            let ((cache, next), prefill) = Stage::time(self.cost.prefill(prompt), || self.prefill(&image))?;
+            let asked = self.cost.query(prompt, self.args.suffix_tokens, passes, rows) * queries as f64;
+            let (found, queries) = Stage::time(asked, || self.ask(&cache, next, &answers, queries))?;
+            let first = first.get_or_insert_with(|| found.clone());
+            let off = first.iter().zip(&found).filter(|(a, b)| a != b).count();
+            if off > 0 {
+                bail!("round {round}: {off} of {} answers are not those of the first round", found.len());
+            }
+            let stages = [vision, prefill, queries];
+            best = Some(match best {
+                Some((known, _)) => (fastest(known, stages), prompt),
+                None => (stages, prompt),
+            });
+        }
+        let Some((stages, prompt)) = best else { bail!("no round") };
+        Ok(Measured { numbers, queries, passes, prompt, stages })
     }
 }
 
 fn main() -> anyhow::Result<()> {
     let args = Args::parse();
     kernels::keep_freed_memory();
-    if [args.suffix_tokens, args.digits, args.queries, args.rounds].contains(&0) {
-        bail!("--queries, --suffix-tokens, --digits and --rounds: at least 1 each");
+    if [args.suffix_tokens, args.digits, args.bins, args.rounds].contains(&0) || args.queries.contains(&0) {
+        bail!("--queries, --suffix-tokens, --digits, --bins and --rounds: at least 1 each");
     }
     let device = device(&args.device)?;
     let config = args.config()?;
@@ -188,30 +249,14 @@ fn main() -> anyhow::Result<()> {
     let grid = Grid { height: cells(args.height), width: cells(args.width) };
     let cost = cost::Cost::new(&config, grid);
     let (model, load) = Stage::time(0.0, || args.load(config.clone(), &device))?;
-    let run = Run { model, device, grid };
-    let mut best: Option<([Stage; 3], usize)> = None;
-    let patches = run.patches()?;
-    let mut answers: Option<Vec<u32>> = None;
-    for round in 1..=args.rounds {
-        let (image, vision) = Stage::time(cost.vision(), || run.encode(&patches))?;
-        let prompt = BEFORE + image.dim(0)? + AFTER;
-        let ((cache, next), prefill) = Stage::time(cost.prefill(prompt), || run.prefill(&image))?;
-        let asked = cost.query(prompt, args.suffix_tokens, args.digits) * args.queries as f64;
-        let (found, queries) = Stage::time(asked, || run.ask(&cache, next, &args))?;
-        let first = answers.get_or_insert_with(|| found.clone());
-        let off = first.iter().zip(&found).filter(|(a, b)| a != b).count();
-        if off > 0 {
-            bail!("round {round}: {off} of {} answered tokens are not those of the first round", found.len());
-        }
-        let stages = [vision, prefill, queries];
-        best = Some(match best {
-            Some((known, _)) => (fastest(known, stages), prompt),
-            None => (stages, prompt),
-        });
-    }
-    let Some((stages, prompt)) = best else { bail!("no round") };
+    let run = Run { args: &args, cost, model, device, grid };
     let peak = run.device.is_cpu().then(|| kernels::peak_gflops(args.weights));
-    report(&args, &load, &stages, peak, prompt, device_memory_bytes(&run.device));
+    for &numbers in &args.numbers {
+        for &queries in &args.queries {
+            let measured = run.measure(numbers, queries)?;
+            report(&args, &load, &measured, peak, device_memory_bytes(&run.device));
+        }
+    }
     Ok(())
 }
 
@@ -220,22 +265,18 @@ fn fastest(a: [Stage; 3], b: [Stage; 3]) -> [Stage; 3] {
     [(a0, b0), (a1, b1), (a2, b2)].map(|(a, b)| if a.seconds < b.seconds { a } else { b })
 }
 
-fn report(
-    args: &Args,
-    load: &Stage,
-    stages: &[Stage; 3],
-    peak: Option<f64>,
-    prompt: usize,
-    device_memory: Option<u64>,
-) {
+fn report(args: &Args, load: &Stage, measured: &Measured, peak: Option<f64>, device_memory: Option<u64>) {
+    let Measured { numbers, queries: asked, passes, prompt, stages } = measured;
     let [vision, prefill, queries] = stages;
-    let per_second = args.queries as f64 / queries.seconds;
-    let tokens = args.suffix_tokens + args.digits - 1;
+    let per_second = *asked as f64 / queries.seconds;
+    let tokens = args.suffix_tokens + passes - 1;
     let rss = peak_rss_bytes().unwrap_or(0);
+    let frame = vision.seconds + prefill.seconds + queries.seconds;
     if args.json {
         let line = json!({
             "load_s": load.seconds, "vision_s": vision.seconds, "prefill_s": prefill.seconds,
-            "queries_s": queries.seconds, "queries": args.queries, "queries_per_second": per_second,
+            "queries_s": queries.seconds, "queries": asked, "queries_per_second": per_second,
+            "numbers": numbers.to_string(), "frame_s": frame,
             "tokens_per_query": tokens, "tokens_per_second": per_second * tokens as f64,
             "prompt_tokens": prompt, "gflops": queries.gflops(), "vision_gflops": vision.gflops(),
             "prefill_gflops": prefill.gflops(), "peak_gflops": peak, "peak_rss_bytes": rss,
@@ -250,7 +291,7 @@ fn report(
         println!("{name:9} {:7.3} {:8.0} {share:>8}", stage.seconds, stage.gflops());
     }
     println!(
-        "{per_second:.1} queries/s, {:.1} tokens/s ({tokens} tokens per query, {prompt} in the shared prefix)",
+        "{asked} queries in {numbers}: {per_second:.1} queries/s, {:.1} tokens/s ({tokens} tokens per query, {prompt} in the shared prefix)",
         per_second * tokens as f64
     );
     let memory = |bytes: u64| format!("{:.2} GB", bytes as f64 * 1e-9);

@@ -2,7 +2,8 @@
 //!
 //! `sdim.json` says how the model is asked (template, pixel reference, numbers, depth normalisation, format version),
 //! which fusion block it has and which layers carry LoRA; `sdim.safetensors` holds the fusion block (`sdim.fusion.*`), the
-//! second patch embedding (`sdim.patch_embed.*`), and the factors `{layer}.lora_A.weight` and `{layer}.lora_B.weight`.
+//! second patch embedding (`sdim.patch_embed.*`), number tokens (`sdim.number_tokens.*`), and the factors `{layer}.lora_A.weight` and
+//! `{layer}.lora_B.weight`.
 
 use super::files::{SETTINGS, TENSORS};
 use super::parts::Parts;

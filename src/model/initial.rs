@@ -1,13 +1,15 @@
 //! Values that training starts from.
 
 use crate::error::Result;
+use crate::query::NumberTokens;
+use crate::vlm::qwen2_5::token_table::FIRST_ADDED;
 use candle_core::{Device, Tensor};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 use std::collections::BTreeMap;
 
-fn normal(rng: &mut ChaCha8Rng) -> f32 {
+pub(super) fn normal(rng: &mut ChaCha8Rng) -> f32 {
     let (u, v): (f32, f32) = (rng.random::<f32>().max(1e-9), rng.random());
     (-2.0 * u.ln()).sqrt() * (std::f32::consts::TAU * v).cos()
 }
@@ -28,6 +30,9 @@ pub fn initial(
     seed: u64,
 ) -> Result<BTreeMap<String, Tensor>> {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let added = number_ids.first().is_some_and(|&id| id >= FIRST_ADDED);
+    let own = format!("{}.embedding", NumberTokens::NAME);
+    let number_rows: Vec<usize> = number_ids.iter().map(|&id| (id % FIRST_ADDED) as usize).collect();
     let mut out = BTreeMap::new();
     for (name, shape) in layout {
         let count: usize = shape.iter().product();
@@ -57,8 +62,9 @@ pub fn initial(
         } else {
             (0..count).map(|_| normal(&mut rng) * std).collect()
         };
-        if name.ends_with("embed_tokens.weight") && number_ids.len() > 11 {
-            write_sinusoids(&mut values, shape[1], number_ids);
+        let numbers = if added { *name == own } else { name.ends_with("embed_tokens.weight") };
+        if numbers && number_rows.len() > 11 {
+            write_sinusoids(&mut values, shape[1], &number_rows);
         }
         out.insert(name.clone(), Tensor::from_vec(values, shape.as_slice(), &Device::Cpu)?);
     }
@@ -67,13 +73,13 @@ pub fn initial(
 
 /// Rows of the number tokens: pairs of cosine and sine of the value at frequencies from half a turn over the whole
 /// range up to one turn over five bins.
-fn write_sinusoids(table: &mut [f32], width: usize, ids: &[u32]) {
+fn write_sinusoids(table: &mut [f32], width: usize, rows: &[usize]) {
     const AMPLITUDE: f32 = 0.28;
     let pairs = width / 2;
-    let top = ids.len() as f32 * 0.4;
-    for (k, &id) in ids.iter().enumerate() {
-        let value = (k as f32 + 0.5) / ids.len() as f32;
-        let row = &mut table[id as usize * width..][..width];
+    let top = rows.len() as f32 * 0.4;
+    for (k, &row) in rows.iter().enumerate() {
+        let value = (k as f32 + 0.5) / rows.len() as f32;
+        let row = &mut table[row * width..][..width];
         for j in 0..pairs {
             let turn = std::f32::consts::PI * top.powf(j as f32 / (pairs - 1).max(1) as f32) * value;
             row[2 * j] = turn.cos() * AMPLITUDE;

@@ -12,6 +12,8 @@ mod generate;
 mod initial;
 mod load;
 mod marked;
+#[cfg(feature = "train")]
+mod number_rows;
 mod parts;
 mod peft;
 mod prefix;

@@ -1,8 +1,9 @@
 //! Everything of a model that has weights.
 
-use crate::error::Result;
+use super::files::SETTINGS;
+use crate::error::{Error, Result};
 use crate::fusion::Fusion;
-use crate::query::Settings;
+use crate::query::{NumberTokens, Settings};
 use crate::vlm::checkpoint::weights::Weights;
 use crate::vlm::layers::linear::Linear;
 use crate::vlm::qwen2_5::QwenVl;
@@ -40,6 +41,32 @@ impl Parts {
             }
             None => None,
         };
-        Ok(Self { vlm: QwenVl::new(config, weights, settings.rope_layout)?, injection, glimpse })
+        let hidden = config.text.hidden_size;
+        let mut vlm = QwenVl::new(config, weights, settings.rope_layout)?;
+        if let Some(bins) = settings.number.bins().filter(|_| settings.number_tokens == NumberTokens::Rows) {
+            check_number_rows(weights, bins.count, hidden)?;
+            vlm.decoder.add_tokens(weights, NumberTokens::NAME, bins.count)?;
+        }
+        Ok(Self { vlm, injection, glimpse })
     }
+}
+
+/// Number tokens that are as wide as the model, but not as many as `sdim.json` says: one of the two files is another checkpoint's, which says
+/// more than a shape.
+fn check_number_rows(weights: &Weights, bins: usize, hidden: usize) -> Result<()> {
+    for part in ["embedding", "head"] {
+        let name = format!("{}.{part}", NumberTokens::NAME);
+        if let Some(&[rows, width]) = weights.shape(&name)
+            && width == hidden
+            && rows != bins
+        {
+            return Err(Error::config(
+                SETTINGS,
+                "number.bins",
+                bins.to_string(),
+                format!("{rows}, the rows of `{name}`"),
+            ));
+        }
+    }
+    Ok(())
 }

@@ -51,8 +51,7 @@ impl SdimModel {
         let prompts = PromptWriter::new(&settings, &tokenizer)?;
         let Parts { vlm, injection, glimpse } = Parts::new(config, &settings, weights)?;
         weights.finish()?;
-        let number_rows = vlm.decoder.head_rows(&prompts.numbers().ids)?;
-        let number_rows = Matrix::from_tensor(&number_rows, weights.format())?;
+        let number_rows = vlm.decoder.head_of(&prompts.numbers().ids, weights.format())?;
         Ok(Self {
             vlm,
             injection,

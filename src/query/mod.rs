@@ -18,7 +18,7 @@ mod unit;
 pub use grammar::{AnswerGrammar, parse_depth};
 pub use marker::{Marker, MarkerShape};
 pub use mode::{AnswerMode, Generation};
-pub use number::{DepthUnit, NumberFormat};
+pub use number::{DepthUnit, NumberFormat, NumberTokens};
 pub use plan::QueryPlan;
 pub use prompt::{FrameSpace, PromptWriter, Query};
 pub use reading::{Reading, Readout};

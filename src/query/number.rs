@@ -6,6 +6,7 @@ use crate::depth::SparseDepth;
 use crate::depth::pixels::CONFIDENT_WITHIN;
 use crate::error::{Error, Result};
 use crate::vlm::chat::tokenizer::Tokenizer;
+use crate::vlm::qwen2_5::token_table::FIRST_ADDED;
 
 /// What the number 1 means in prompts and answers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
@@ -75,12 +76,45 @@ pub enum NumberFormat {
     },
 }
 
+/// Where the tokens of numbers that are bins come from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum NumberTokens {
+    /// `tokenizer.json` has them by their names.
+    #[default]
+    Vocabulary,
+    /// They have no text: each is a row of `sdim.number_tokens.embedding` and, unless the base ties its head to the embedding, of
+    /// `sdim.number_tokens.head`, both `[bins, hidden]`. So a published checkpoint gets them from an adapter.
+    Rows,
+}
+
+impl NumberTokens {
+    /// The tensors that hold [`NumberTokens::Rows`], without their last part.
+    pub(crate) const NAME: &str = "sdim.number_tokens";
+
+    pub(crate) fn in_vocabulary(&self) -> bool {
+        *self == Self::Vocabulary
+    }
+
+    /// Checks that only bins have rows.
+    ///
+    /// # Errors
+    /// [`Error::Config`] names the field of `sdim.json`.
+    pub(super) fn validate(self, file: &str, format: NumberFormat) -> Result<()> {
+        if self.in_vocabulary() || format.bins().is_some() {
+            return Ok(());
+        }
+        let expected = "\"vocabulary\", since numbers are digits; or bins as `number`";
+        Err(Error::config(file, "number_tokens", "rows", expected))
+    }
+}
+
 /// A number format with the ids of its tokens.
 #[derive(Debug, Clone)]
 pub struct Numbers {
     /// How numbers are written.
     pub format: NumberFormat,
-    /// Token ids: one per bin; or `0` to `9` and the point.
+    /// Token ids: one per bin, from [`FIRST_ADDED`] on where they are rows of their own; or `0` to `9` and the point.
     pub ids: Vec<u32>,
 }
 
@@ -135,8 +169,9 @@ impl Numbers {
     ///
     /// # Errors
     /// [`Error::Tokenizer`] names a token that the vocabulary lacks.
-    pub fn new(format: NumberFormat, tokenizer: &Tokenizer) -> Result<Self> {
+    pub fn new(format: NumberFormat, tokens: NumberTokens, tokenizer: &Tokenizer) -> Result<Self> {
         let ids = match format.bins() {
+            Some(bins) if tokens == NumberTokens::Rows => (FIRST_ADDED..).take(bins.count).collect(),
             Some(bins) => (0..bins.count).map(|k| tokenizer.id(&bin_token(k))).collect::<Result<_>>()?,
             None => "0123456789.".chars().map(|c| tokenizer.id(&c.to_string())).collect::<Result<_>>()?,
         };

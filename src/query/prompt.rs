@@ -167,7 +167,7 @@ impl PromptWriter {
             PixelReference::Coordinates | PixelReference::Marker(_) => None,
         };
         let mut writer = Self {
-            numbers: Numbers::new(settings.number, tokenizer)?,
+            numbers: Numbers::new(settings.number, settings.number_tokens, tokenizer)?,
             before_image: tokenizer.encode(&t.before_image)?,
             after_image: tokenizer.encode(&t.after_image)?,
             pieces: Vec::new(),

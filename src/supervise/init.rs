@@ -5,8 +5,8 @@ use super::vocabulary::byte_tokenizer;
 use crate::error::{Error, Result};
 use crate::files::{read_text, write_tensors, write_whole};
 use crate::model::{CheckpointFiles, SETTINGS, SdimModel, initial};
-use crate::query::Settings;
 use crate::query::number::Numbers;
+use crate::query::{NumberTokens, Settings};
 use crate::vlm::checkpoint::weights::Weights;
 use crate::vlm::files::{CONFIG, PREPROCESSOR, TOKENIZER};
 use candle_core::{Device, Tensor};
@@ -41,7 +41,8 @@ impl FreshFiles {
     /// # Errors
     /// [`Error::Config`] names the key whose size does not fit; [`Error::Format`] if a part cannot be written as JSON.
     pub fn of(shape: &Shape, settings: &Settings) -> Result<Self> {
-        let numbers = settings.number.bins().map_or(0, |bins| bins.count);
+        let bins = settings.number.bins().filter(|_| settings.number_tokens == NumberTokens::Vocabulary);
+        let numbers = bins.map_or(0, |bins| bins.count);
         let text = |what: &str, value: &Value| {
             serde_json::to_string_pretty(value).map_err(|e| Error::format(what, e.to_string(), "JSON"))
         };
@@ -74,7 +75,8 @@ impl FreshFiles {
     pub fn initial(&self, seed: u64) -> Result<BTreeMap<String, Tensor>> {
         let parsed = self.parse()?;
         let layers = parsed.config.text.layers;
-        let number_ids = Numbers::new(parsed.settings.number, &parsed.tokenizer)?.ids;
+        let (format, tokens) = (parsed.settings.number, parsed.settings.number_tokens);
+        let number_ids = Numbers::new(format, tokens, &parsed.tokenizer)?.ids;
         let empty = Weights::from_tensors("fresh", Default::default());
         // Building on nothing fails, but not before each tensor was asked for.
         match SdimModel::new(parsed, &empty, &Device::Cpu) {
@@ -150,5 +152,20 @@ mod tests {
         let marked = files.tokenizer.encode("<|vision_start|><|image_pad|>").unwrap();
         assert_eq!(marked, [files.config.ids.vision_start, files.config.ids.image]);
         assert!(files.tokenizer.vocab_size() <= files.config.text.vocab_size);
+    }
+
+    #[test]
+    fn number_tokens_of_their_own_start_as_those_of_a_vocabulary() {
+        let of = |number_tokens| {
+            let files = FreshFiles::tiny(&Settings { number_tokens, ..Settings::tiny() }).unwrap();
+            (files.parse().unwrap(), files.initial(1).unwrap())
+        };
+        let ((files, named), (_, rows)) = (of(NumberTokens::Vocabulary), of(NumberTokens::Rows));
+        let first = files.tokenizer.id("<|d0|>").unwrap() as usize;
+        let table = "model.embed_tokens.weight";
+        let values = |t: &Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+        let own = &rows["sdim.number_tokens.embedding"];
+        assert_eq!(values(own), values(&named[table].narrow(0, first, 1000).unwrap()));
+        assert!(rows[table].dims()[0] < 300, "words alone: {:?}", rows[table].dims());
     }
 }

@@ -7,7 +7,7 @@ use super::recipe::BatchConfig;
 use super::shard::{About, Dims, Shard, VERSION};
 use crate::depth::SparsePattern;
 use crate::error::{Error, Result};
-use crate::query::{Hint, MeasurementPrompt, PixelReference};
+use crate::query::{Hint, MeasurementPrompt, NumberTokens, PixelReference};
 use crate::scenes::RgbdFrame;
 use image::RgbImage;
 use rand::Rng;
@@ -83,7 +83,11 @@ impl RecordConfig {
             return Err(Error::argument("held-out set", format!("{:?}", self.set), "at least 1 of each"));
         }
         let s = asking.prompts.settings();
-        let vocabulary = asking.config.text.vocab_size;
+        // What a record calls a number: its token, or its row.
+        let (key, ids) = match s.number_tokens {
+            NumberTokens::Vocabulary => ("vocab_size", asking.config.text.vocab_size),
+            NumberTokens::Rows => ("number.bins", asking.prompts.numbers().ids.len()),
+        };
         for (key, fits) in [
             ("pixel_reference", matches!(s.pixel_reference, PixelReference::Pointer { .. })),
             ("measurements", matches!(s.measurements, MeasurementPrompt::Prefix { .. })),
@@ -91,7 +95,7 @@ impl RecordConfig {
             ("hint", s.hint == Hint::Linear),
             ("template.query", s.template.query == "{pixel}" && s.template.forced().is_empty()),
             ("fusion", s.fusion.is_some()),
-            ("vocab_size", vocabulary <= 1 << 16),
+            (key, ids <= 1 << 16),
         ] {
             if !fits {
                 return Err(Error::config("sdim.json", key, "another way of asking", "that of sdim-tiny"));

@@ -19,16 +19,18 @@
 //! | `asked_hint` | f32 `[n, v, q]` | the hint |
 //! | `asked_value` | f32 `[n, v, q]` | the true answer; NaN where it is not known |
 //!
+//! A token is told by its id, or by its row where number tokens are rows of their own ([`NumberTokens::Rows`] in the settings).
 //! The file's metadata holds [`About`] as JSON under `sdim_records`.
 
 use super::batch::{Asking, Example, Item};
 use crate::depth::SparseDepth;
 use crate::error::{Error, Result};
 use crate::files::write_whole;
-use crate::query::Settings;
 use crate::query::prompt::{FrameSpace, MEASURED_TIME, QUERY_TIME, Tokens};
+use crate::query::{NumberTokens, Settings};
 use crate::vlm::qwen2_5::grid::Grid;
 use crate::vlm::qwen2_5::preprocess::Pixels;
+use crate::vlm::qwen2_5::token_table::FIRST_ADDED;
 use image::RgbImage;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use std::collections::HashMap;
@@ -162,7 +164,7 @@ impl Shard {
         self.told_count.push(told.len() as u16);
         for i in 0..self.dims.told {
             let (id, x, y) = told.get(i).map_or((0, 0.0, 0.0), |g| (example.prefix.ids[g.token], g.x, g.y));
-            self.told_id.push(id as u16);
+            self.told_id.push((id % FIRST_ADDED) as u16);
             self.told_x.push(x.round() as u16);
             self.told_y.push(y.round() as u16);
         }
@@ -171,7 +173,7 @@ impl Shard {
                 let found = format!("{} tokens, {} in the answer", item.tokens.len(), item.supervised);
                 return Err(Error::argument("question", found, "one token at a pixel, one in the answer"));
             };
-            self.asked_id.push(*id as u16);
+            self.asked_id.push((*id % FIRST_ADDED) as u16);
             self.asked_x.push(at.x.round() as u16);
             self.asked_y.push(at.y.round() as u16);
             self.asked_hint.push(item.hint);
@@ -327,7 +329,7 @@ impl Shard {
         let place = |x: &[u16], y: &[u16], i: usize| (usize::from(x[i]), usize::from(y[i]));
         for i in (0..usize::from(self.told_count[at])).map(|i| at * d.told + i) {
             let pixel = place(&self.told_x, &self.told_y, i);
-            prefix.push_at(&[self.told_id[i].into()], pixel, MEASURED_TIME, &space);
+            prefix.push_at(&[self.token(self.told_id[i])], pixel, MEASURED_TIME, &space);
         }
         let items = (at * d.asked..(at + 1) * d.asked).map(|i| self.item(asking, &space, at, i)).collect();
         let rgb = self.rgb[frame * area * 3..][..area * 3].to_vec();
@@ -336,10 +338,18 @@ impl Shard {
         Ok(Example { pixels: Pixels { resized, grid }, scattered, unit, prefix, items })
     }
 
+    /// The id of a token that the records tell.
+    fn token(&self, told: u16) -> u32 {
+        match self.about.settings.number_tokens {
+            NumberTokens::Vocabulary => told.into(),
+            NumberTokens::Rows => FIRST_ADDED + u32::from(told),
+        }
+    }
+
     fn item(&self, asking: Asking, space: &FrameSpace, at: usize, i: usize) -> Item {
         let mut tokens = Tokens::default();
         let pixel = (usize::from(self.asked_x[i]), usize::from(self.asked_y[i]));
-        tokens.push_at(&[self.asked_id[i].into()], pixel, QUERY_TIME, space);
+        tokens.push_at(&[self.token(self.asked_id[i])], pixel, QUERY_TIME, space);
         let value = self.asked_value[i];
         let answer = asking.prompts.numbers().write(value);
         let (hint, scale) = (self.asked_hint[i], self.scale[at]);

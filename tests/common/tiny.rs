@@ -158,7 +158,8 @@ pub fn wake(tensors: &mut Tensors) {
 pub fn tensors(files: &FreshFiles, seed: u64) -> Tensors {
     let parsed = files.parse().unwrap();
     let layers = parsed.config.text.layers;
-    let numbers = Numbers::new(parsed.settings.number, &parsed.tokenizer).unwrap().ids;
+    let (format, source) = (parsed.settings.number, parsed.settings.number_tokens);
+    let numbers = Numbers::new(format, source, &parsed.tokenizer).unwrap().ids;
     let empty = Weights::from_tensors("empty", Tensors::new());
     assert!(SdimModel::new(parsed, &empty, &Device::Cpu).is_err(), "built from nothing");
     initial(&empty.wanted(), &numbers, layers, seed).unwrap().into_iter().collect()

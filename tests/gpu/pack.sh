@@ -6,7 +6,7 @@ set -euo pipefail
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 cd "$here/../.."
 programs=(complete throughput)
-tests=(golden device shared_prefix fusion complete bad_checkpoint)
+tests=(golden device number_tokens shared_prefix fusion complete bad_checkpoint)
 
 # A build that was cut off leaves kernels without text, which would be found out on the device only.
 whole() {
@@ -43,6 +43,8 @@ for name in lib "${tests[@]}"; do strip -o "$stage/bin/test-$name" "$(awk -v n="
 cp -r assets/example "$stage/assets/"
 cp -r tests/fixtures/qwen_small tests/fixtures/family "$stage/tests/fixtures/"
 cp "$here/libraries.py" "$here/report.py" "$stage/"
+mkdir -p "$stage/benches/peers"
+cp benches/peers/shared_prefix.py benches/peers/compare.sh "$stage/benches/peers/"
 # The programs have most of their bytes in common: the dictionary holds all of them.
 tar -C "$stage" -cf - . | xz -T1 --lzma2=preset=1,dict=384MiB >"$here/out/payload.tar.xz"
 ls -l "$here/out/payload.tar.xz"

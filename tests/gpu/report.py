@@ -1,4 +1,4 @@
-"""One line of the table of run.sh: `frame LOG` and `model LOG` of a JSON object, `maps A B` of two .npy files of depths."""
+"""Lines of the table of run.sh: `frame LOG` of a JSON object, `model LOG` of one or more, `maps A B` of two .npy files of depths."""
 
 import array
 import json
@@ -25,11 +25,14 @@ def frame(path):
 
 
 def model(path):
-    o = loaded(path)
-    print(
-        f"    load {o['load_s']:.1f} s, vision {o['vision_s']:.4f} s, prefix of {o['prompt_tokens']} {o['prefill_s']:.4f} s, "
-        f"{o['queries_per_second']:.0f} queries/s, {o['gflops'] / 1e3:.0f} TFLOP/s{memory(o)}"
-    )
+    with open(path) as file:
+        lines = [json.loads(line) for line in file if line.startswith("{")]
+    for o in lines:
+        print(
+            f"    load {o['load_s']:.1f} s, vision {o['vision_s']:.4f} s, prefix of {o['prompt_tokens']} {o['prefill_s']:.4f} s, "
+            f"{o['queries']} in {o['numbers']} at {o['queries_per_second']:.0f} queries/s, {o['gflops'] / 1e3:.0f} TFLOP/s, "
+            f"{o['frame_s']:.3f} s a frame{memory(o)}"
+        )
 
 
 def depths(path):

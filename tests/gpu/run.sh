@@ -1,13 +1,13 @@
 #!/usr/bin/env bash
 # Checks sdim on a CUDA device: answers against the CPU's, the golden tensors, repeats from several threads, times.
 #
-#   bash tests/gpu/run.sh [SECONDS]     200 if nothing is said; all ends within them, the most important first
+#   bash tests/gpu/run.sh [SECONDS]     235 if nothing is said; all ends within them, the most important first
 #
 # Beside it, or in out/: payload.tar.xz of pack.sh. Needs a driver, Python, and CUDA's run-time libraries (PyTorch's wheels have
 # them). Prints a table; everything else goes to $OUT.
 set -u
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
-budget=${1:-200}
+budget=${1:-235}
 out=${OUT:-$here/out/results}
 mkdir -p "$out/logs"
 table=$out/table.txt
@@ -79,6 +79,19 @@ model() {
     python3 "$work/report.py" model "$out/logs/$name.log" >>"$table"
 }
 
+# The same 3B work in PyTorch and here, where transformers is installed. PyTorch copies the prefix for each item of a batch.
+peers() {
+    local limit=$1
+    shift
+    if ! python3 -c 'import torch, transformers' 2>"$out/logs/peers-import.log"; then
+        note "peers                  left out: $(tail -n 1 "$out/logs/peers-import.log" | cut -c1-100)"
+        return 0
+    fi
+    check peers "$limit" env OURS="$work/bin/throughput" PYTHON=python3 OURS_ARGS="--batch 2048" PEER_ARGS="--batch 1024" \
+        bash "$work/benches/peers/compare.sh" "$@" || return 0
+    sed 's/^/    /' "$out/logs/peers.log" >>"$table"
+}
+
 compare() {
     [ -e "$out/maps/$1/dense.npy" ] && [ -e "$out/maps/$2/dense.npy" ] || return 0
     note "$(printf '    %s against %s: %s' "$2" "$1" "$(python3 "$work/report.py" maps "$out/maps/$1/dense.npy" "$out/maps/$2/dense.npy" 2>&1 | tail -n 1)")"
@@ -103,15 +116,18 @@ tests device 45 device --test-threads 2
 # Those unit tests of the kernels that choose their device, `on_device` in src/kernels/testing.rs, with the ones beside them.
 tests kernels 20 lib kernels::ops::norm kernels::ops::rope kernels::ops::bin_rows kernels::attention::batched
 model 3b-bf16 60 --random 3b --weights bf16 --queries 4096 --batch 2048 --rounds 3
+# A frame of 644x476 with one number token for an answer: every fourth column and row, then every pixel.
+model 3b-number-tokens 75 --random 3b --weights bf16 --numbers bins --queries 19159,306544 --batch 4096 --rounds 2
+peers 75 --device cuda:0 --shapes 3b --queries 4096 --rounds 2
 frame stride4-f32 15 --device cuda:0 --weights f32 --plan stride:4 --repeat 4
 frame stride4-bf16 15 --device cuda:0 --weights bf16 --plan stride:4 --repeat 4
 frame every-bf16 20 --device cuda:0 --weights bf16 --plan every --repeat 3
 frame every-f32 20 --device cuda:0 --weights f32 --plan every --repeat 3
+tests number_tokens 20 number_tokens
 tests shared_prefix 30 shared_prefix
 tests fusion 15 fusion
 tests complete 25 complete
 tests bad_checkpoint 20 bad_checkpoint
-model 3b-one-token 30 --random 3b --weights bf16 --queries 8192 --batch 4096 --digits 1 --rounds 2
 frame every-cpu 25 --device cpu --weights f32 --plan every
 compare every-cpu every-f32
 model 3b-batch512 30 --random 3b --weights bf16 --queries 1024 --batch 512 --rounds 2

@@ -45,6 +45,8 @@ class Config:
         wanted = {
             "tie_word_embeddings": self.text["tie_word_embeddings"] is True,
             "sdim.json, number": number["kind"] in ("bins", "log_bins"),
+            # Rows behind the vocabulary are for published checkpoints, which are not trained here.
+            "sdim.json, number_tokens": self.sdim.get("number_tokens", "vocabulary") == "vocabulary",
             "sdim.json, pixel_reference": self.sdim["pixel_reference"]["kind"] == "pointer",
             "sdim.json, hint": self.sdim["hint"] == "linear",
             "sdim.json, fusion": fusion is not None,

@@ -145,6 +145,14 @@ impl Stored {
         Ok(widened(&self.bytes()?, self.dtype))
     }
 
+    /// Some rows of a matrix as f32 on the CPU; `ids` are below the number of its rows, which have `columns` values.
+    #[cfg(feature = "train")]
+    pub(crate) fn rows(&self, ids: &[u32], columns: usize) -> Result<Tensor> {
+        let (bytes, row) = (self.bytes()?, columns * self.dtype.size_in_bytes());
+        let values = ids.iter().flat_map(|&id| widened(&bytes[id as usize * row..][..row], self.dtype));
+        Ok(Tensor::from_vec(values.collect::<Vec<f32>>(), (ids.len(), columns), &Device::Cpu)?)
+    }
+
     /// The tensor on the CPU in the type in which it is stored.
     pub(crate) fn tensor(&self) -> Result<Tensor> {
         Ok(Tensor::from_raw_buffer(&self.bytes()?, self.dtype, self.shape(), &Device::Cpu)?)

@@ -176,6 +176,11 @@ impl Weights {
         self.sources.contains_key(name)
     }
 
+    /// The shape of the tensor of this name; `None` if it is not there.
+    pub(crate) fn shape(&self, name: &str) -> Option<&[usize]> {
+        self.sources.get(name).map(Source::dims)
+    }
+
     /// Whether a tensor of this name and shape can be had. If not, that is recorded, and no memory is set aside.
     ///
     /// # Errors
@@ -242,6 +247,23 @@ impl Weights {
                     Ok(Raw::Absent(shape))
                 }
             },
+        }
+    }
+
+    /// Some rows of the matrix of this name, `[ids, columns]`, without a look at the others.
+    ///
+    /// # Errors
+    /// [`Error::TensorSet`] or [`Error::Tensor`] if there is no such matrix or it has another shape; [`Error::Argument`] on a row that is
+    /// not there.
+    #[cfg(feature = "train")]
+    pub(crate) fn rows(&self, name: &str, shape: [usize; 2], ids: &[u32]) -> Result<Tensor> {
+        if let Some(id) = ids.iter().find(|&&id| id as usize >= shape[0]) {
+            return Err(Error::argument("token id", id, format!("below {}, the rows of `{name}`", shape[0])));
+        }
+        match self.raw(name, shape)? {
+            Raw::Stored(stored) => stored.rows(ids, shape[1]),
+            Raw::Tensor(tensor) => Ok(tensor.index_select(&Tensor::new(ids, tensor.device())?, 0)?),
+            Raw::Absent(_) => Err(self.wrong(Vec::new())),
         }
     }
 

@@ -5,8 +5,9 @@
 use super::cache::KvCache;
 use super::config::TextConfig;
 use super::rope::{MRope, RopeLayout, RopeTable};
+use super::token_table::TokenTable;
 use crate::error::{Error, Result};
-use crate::kernels::{self, AttentionLayout, Block, Precision, SharedKeys};
+use crate::kernels::{self, AttentionLayout, Block, Precision, SharedKeys, WeightFormat};
 use crate::vlm::checkpoint::weights::Weights;
 use crate::vlm::layers::linear::{JoinedLinear, Linear};
 use crate::vlm::layers::matrix::Matrix;
@@ -141,11 +142,11 @@ enum Kept {
 /// The decoder with its embedding and output head.
 pub struct Decoder {
     config: TextConfig,
-    embed_tokens: Matrix,
+    embed_tokens: TokenTable,
     layers: Vec<DecoderLayer>,
     norm: RmsNorm,
-    /// `[vocab, hidden]`: `lm_head`, or the embedding itself where the config ties them.
-    head: Matrix,
+    /// `lm_head`, or the embedding itself where the config ties them.
+    head: TokenTable,
     rope: MRope,
     precision: Precision,
 }
@@ -157,13 +158,13 @@ impl Decoder {
     /// As [`Weights::get`].
     pub fn new(config: &TextConfig, weights: &Weights, layout: RopeLayout) -> Result<Self> {
         let table = [config.vocab_size, config.hidden_size];
-        let embed_tokens = Matrix::read(weights, "model.embed_tokens.weight", table)?;
+        let embed_tokens = TokenTable::read(weights, "model.embed_tokens.weight", table)?;
         let head = if config.tie_word_embeddings {
             // Merged or re-saved tied checkpoints can carry a redundant copy.
             weights.ignore("lm_head.weight");
             embed_tokens.clone()
         } else {
-            Matrix::read(weights, "lm_head.weight", table)?
+            TokenTable::read(weights, "lm_head.weight", table)?
         };
         Ok(Self {
             embed_tokens,
@@ -176,6 +177,21 @@ impl Decoder {
             precision: weights.format().into(),
             config: config.clone(),
         })
+    }
+
+    /// Puts `count` tokens behind the vocabulary, whose ids are those from [`FIRST_ADDED`](super::token_table::FIRST_ADDED) on: rows of
+    /// `{name}.embedding` and, unless the head is tied to the embedding, of `{name}.head`, both `[count, hidden]`.
+    ///
+    /// # Errors
+    /// As [`Weights::get`].
+    pub fn add_tokens(&mut self, weights: &Weights, name: &str, count: usize) -> Result<()> {
+        let shape = [count, self.config.hidden_size];
+        self.embed_tokens.add(weights, &format!("{name}.embedding"), shape)?;
+        if self.config.tie_word_embeddings {
+            self.head = self.embed_tokens.clone();
+            return Ok(());
+        }
+        self.head.add(weights, &format!("{name}.head"), shape)
     }
 
     /// The decoder's configuration.
@@ -344,11 +360,19 @@ impl Decoder {
         self.head.rows(ids)
     }
 
-    /// Logits over the entire vocabulary of normed hidden states, `[rows, vocab]`.
+    /// As [`Decoder::head_rows`], as a matrix in a format, to multiply by.
+    ///
+    /// # Errors
+    /// As [`Decoder::head_rows`] and [`Matrix::from_tensor`].
+    pub fn head_of(&self, ids: &[u32], format: WeightFormat) -> Result<Matrix> {
+        self.head.matrix_of(ids, format)
+    }
+
+    /// Logits over the entire vocabulary of normed hidden states, `[rows, vocab]`; tokens that were put behind it are not among them.
     ///
     /// # Errors
     /// [`Error::Tensors`] on another width.
     pub fn logits(&self, normed: &Tensor) -> Result<Tensor> {
-        self.head.linear(normed, None)
+        self.head.vocabulary().linear(normed, None)
     }
 }

@@ -13,6 +13,7 @@ pub mod positions;
 pub mod preprocess;
 pub mod rope;
 pub mod sequences;
+pub mod token_table;
 pub mod vision;
 
 pub use model::QwenVl;
