@@ -8,6 +8,7 @@ mod common;
 use anyhow::ensure;
 use clap::Parser;
 use common::{load_as, load_options, rounded, stdout};
+use sdim::cloud::{CloudOptions, PointCloud};
 use sdim::depth::{ProjectionReport, Visibility};
 use sdim::messages::{CameraInfo, Image, PointCloud2, PointField};
 use sdim::{
@@ -62,7 +63,8 @@ fn answer(
     let (sparse, projected) =
         SparseDepth::from_cloud(points, &camera, &messages.lidar_to_camera, &Visibility::default())?;
     let map = completer.complete(&rgb, &sparse, options)?;
-    let cloud = PointCloud2::from_depth(&map, &camera, Some(&rgb), min_confidence)?;
+    let sure = CloudOptions::default().with_min_confidence(min_confidence);
+    let cloud = PointCloud2::from_cloud(&PointCloud::from_map(&map, Some(&rgb), &camera, &sure)?)?;
     Ok(Answer { cloud, depth: Image::from_depth(&map), projected })
 }
 

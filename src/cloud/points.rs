@@ -31,7 +31,7 @@ impl PointCloud {
     }
 
     /// Fails unless every part has an entry per point.
-    pub(super) fn check(&self) -> Result<()> {
+    pub(crate) fn check(&self) -> Result<()> {
         let length =
             |what, part: Option<usize>| part.map_or(Ok(()), |n| check_length(what, n, self.points.len()));
         length("colours", self.colours.as_ref().map(Vec::len))?;

@@ -1,8 +1,7 @@
 //! `sensor_msgs/PointCloud2`: points with fields at offsets.
 
-use crate::depth::{Camera, DepthMap};
+use crate::cloud::PointCloud;
 use crate::error::{Error, Result};
-use image::RgbImage;
 
 /// Where a number of each point stands.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -130,67 +129,45 @@ impl PointCloud2 {
         Ok(Coordinate { offset: field.offset as usize, wide: bytes == 8, big: self.is_bigendian })
     }
 
-    /// The valid pixels of a map as points in the camera's axes (x right, y down, z forward), metres, row by row, without those whose confidence
-    /// is below `min_confidence` or where the lens model has no ray.
+    /// A cloud as a message, for instance that of a completed map ([`PointCloud::from_map`], in the camera's axes).
     ///
-    /// Fields are `x`, `y`, `z`, with a picture `rgb`, and `confidence`, all FLOAT32 and little-endian. As PCL and rviz expect it, `rgb` holds the
-    /// bits 0x00RRGGBB.
+    /// Fields are `x`, `y`, `z` and, where the cloud has them, `rgb`, `normal_x`, `normal_y`, `normal_z` and `confidence`, all FLOAT32 and
+    /// little-endian. As PCL and rviz expect it, `rgb` holds the bits 0x00RRGGBB.
     ///
     /// # Errors
-    /// [`Error::Argument`] unless the map has the size of `camera`, and for a confidence outside of 0..=1; [`Error::SizeMismatch`] for a picture of
-    /// another size.
-    pub fn from_depth(
-        map: &DepthMap,
-        camera: &Camera,
-        rgb: Option<&RgbImage>,
-        min_confidence: f32,
-    ) -> Result<Self> {
-        let (width, height) = (map.width(), map.height());
-        if (camera.width(), camera.height()) != (width, height) {
-            let found = format!("{}x{}", camera.width(), camera.height());
-            return Err(Error::argument("camera", found, format!("the size of the map, {width}x{height}")));
-        }
-        if let Some(rgb) = rgb.filter(|rgb| (rgb.width() as usize, rgb.height() as usize) != (width, height))
-        {
-            let rgb = (rgb.width() as usize, rgb.height() as usize);
-            return Err(Error::SizeMismatch { rgb, depth: (width, height) });
-        }
-        if !(0.0..=1.0).contains(&min_confidence) {
-            return Err(Error::argument("min_confidence", min_confidence, "a value in 0..=1"));
-        }
-        let names = ["x", "y", "z"].into_iter().chain(rgb.map(|_| "rgb")).chain(["confidence"]);
+    /// [`Error::BufferLength`] unless each part of the cloud has one entry per point; [`Error::Argument`] for more points than fill 4 GiB.
+    pub fn from_cloud(cloud: &PointCloud) -> Result<Self> {
+        cloud.check()?;
+        let normals = cloud.normals.as_deref();
+        let names = (["x", "y", "z"].into_iter())
+            .chain(cloud.colours.as_ref().map(|_| "rgb"))
+            .chain(normals.into_iter().flat_map(|_| ["normal_x", "normal_y", "normal_z"]))
+            .chain(cloud.confidence.as_ref().map(|_| "confidence"));
         let fields: Vec<PointField> =
             names.zip(0..).map(|(name, i)| PointField::float32(name, 4 * i)).collect();
         let point_step = 4 * fields.len() as u32;
-        let mut data = Vec::new();
-        let values = map.depth().iter().zip(map.confidence()).enumerate();
-        for (pixel, (&depth, &confidence)) in
-            values.filter(|(_, (d, c))| !d.is_nan() && **c >= min_confidence)
-        {
-            let (x, y) = (pixel % width, pixel / width);
-            let Some(ray) = camera.ray(x as f32, y as f32) else { continue };
-            ray.iter().for_each(|c| data.extend((c * depth).to_le_bytes()));
-            if let Some(rgb) = rgb {
-                let [r, g, b] = rgb.get_pixel(x as u32, y as u32).0;
+        let row_step = u32::try_from(cloud.len()).ok().and_then(|count| count.checked_mul(point_step));
+        let Some(row_step) = row_step else {
+            return Err(Error::argument("cloud", cloud.len(), "fewer points than fill 4 GiB"));
+        };
+        let mut data = Vec::with_capacity(row_step as usize);
+        for (i, point) in cloud.points.iter().enumerate() {
+            point.iter().for_each(|c| data.extend(c.to_le_bytes()));
+            if let Some([r, g, b]) = cloud.colours.as_ref().map(|all| all[i]) {
                 data.extend([b, g, r, 0]);
             }
-            data.extend(confidence.to_le_bytes());
+            normals.into_iter().flat_map(|all| all[i]).for_each(|c| data.extend(c.to_le_bytes()));
+            data.extend(cloud.confidence.iter().flat_map(|all| all[i].to_le_bytes()));
         }
-        // A map has at most 2^28 pixels; of so many, one row's bytes are not a number of 32 bits.
-        let row_step = u32::try_from(data.len()).map_err(|_| Error::ImageSize {
-            width,
-            height,
-            reason: "expected fewer points than fill 4 GiB".to_string(),
-        })?;
         let width = row_step / point_step;
-        Ok(Self { height: 1, width, fields, is_bigendian: false, point_step, row_step, data, is_dense: true })
+        let is_dense = cloud.points.iter().flatten().all(|c| c.is_finite());
+        Ok(Self { height: 1, width, fields, is_bigendian: false, point_step, row_step, data, is_dense })
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::depth::{Distortion, Intrinsics};
 
     const POINTS: [[f32; 3]; 4] =
         [[1.0, 2.0, 3.0], [-4.5, 0.25, 9.0], [f32::NAN, 0.0, 0.0], [7.0, 8.0, -1.0]];
@@ -267,43 +244,38 @@ mod tests {
         assert!(matches!(huge, Error::BufferLength { .. }));
     }
 
-    fn map() -> (DepthMap, Camera) {
-        let k = Intrinsics { fx: 2.0, fy: 4.0, cx: 1.0, cy: 0.0 };
-        let depth = vec![1.0, 2.0, f32::NAN, 4.0];
-        let map = DepthMap::new(2, 2, depth, vec![0.9, 0.4, 0.9, 0.5], vec![0.1; 4], vec![false; 4]).unwrap();
-        (map, Camera::new(2, 2, k, Distortion::None).unwrap())
-    }
-
     #[test]
-    fn maps_become_clouds() {
-        let (map, camera) = map();
-        let plain = PointCloud2::from_depth(&map, &camera, None, 0.0).unwrap();
-        assert_eq!((plain.height, plain.width, plain.point_step), (1, 3, 16));
-        assert_eq!(plain.points().unwrap(), [[-0.5, 0.0, 1.0], [0.0, 0.0, 2.0], [0.0, 1.0, 4.0]]);
+    fn clouds_become_messages() {
+        let points = vec![[-0.5, 0.0, 1.0], [0.0, 1.0, 4.0]];
+        let mut cloud = PointCloud { points: points.clone(), ..Default::default() };
+        let plain = PointCloud2::from_cloud(&cloud).unwrap();
+        assert_eq!((plain.height, plain.width, plain.point_step, plain.row_step), (1, 2, 12, 24));
+        assert!(plain.is_dense && plain.points().unwrap() == points);
 
-        let rgb = RgbImage::from_fn(2, 2, |x, y| image::Rgb([10 + x as u8, 20 + y as u8, 30]));
-        let coloured = PointCloud2::from_depth(&map, &camera, Some(&rgb), 0.5).unwrap();
-        assert_eq!((coloured.width, coloured.point_step, coloured.row_step), (2, 20, 40));
-        assert_eq!(coloured.points().unwrap(), [[-0.5, 0.0, 1.0], [0.0, 1.0, 4.0]]);
+        cloud.colours = Some(vec![[1, 2, 3], [11, 21, 30]]);
+        cloud.confidence = Some(vec![0.9, 0.5]);
+        let coloured = PointCloud2::from_cloud(&cloud).unwrap();
         let names: Vec<_> = coloured.fields.iter().map(|f| (&f.name[..], f.offset)).collect();
         assert_eq!(names, [("x", 0), ("y", 4), ("z", 8), ("rgb", 12), ("confidence", 16)]);
         assert_eq!(coloured.data[32..36], 0x000b_151eu32.to_le_bytes());
         assert_eq!(coloured.data[36..40], 0.5f32.to_le_bytes());
-        let none = PointCloud2::from_depth(&map, &camera, None, 1.0).unwrap();
+
+        cloud.normals = Some(vec![[0.0, 0.0, -1.0], [f32::NAN; 3]]);
+        cloud.points[1] = [f32::NAN; 3];
+        let all = PointCloud2::from_cloud(&cloud).unwrap();
+        assert_eq!((all.point_step, all.fields[6].name.as_str(), all.is_dense), (32, "normal_z", false));
+        assert_eq!(all.data[24..28], (-1f32).to_le_bytes());
+        let none = PointCloud2::from_cloud(&PointCloud::default()).unwrap();
         assert_eq!((none.width, none.points().unwrap().len()), (0, 0));
     }
 
     #[test]
-    fn sizes_of_map_camera_and_picture_agree() {
-        let (map, camera) = map();
-        let other = Camera::new(3, 2, camera.intrinsics(), Distortion::None).unwrap();
-        let wrong = PointCloud2::from_depth(&map, &other, None, 0.0);
-        assert!(matches!(wrong, Err(Error::Argument { name: "camera", .. })));
-        let wrong = PointCloud2::from_depth(&map, &camera, Some(&RgbImage::new(2, 3)), 0.0);
-        assert!(matches!(wrong, Err(Error::SizeMismatch { rgb: (2, 3), depth: (2, 2) })));
-        for confidence in [-0.1, 1.5, f32::NAN] {
-            let wrong = PointCloud2::from_depth(&map, &camera, None, confidence);
-            assert!(matches!(wrong, Err(Error::Argument { name: "min_confidence", .. })));
-        }
+    fn parts_of_another_length_are_refused() {
+        let cloud =
+            PointCloud { points: vec![[0.0; 3]; 2], confidence: Some(vec![1.0]), ..Default::default() };
+        assert!(matches!(
+            PointCloud2::from_cloud(&cloud),
+            Err(Error::BufferLength { expected: 2, found: 1, .. })
+        ));
     }
 }
