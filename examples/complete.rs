@@ -20,8 +20,8 @@ use sdim::draw::preview;
 use sdim::metrics::{Errors, errors};
 use sdim::system::{device_memory_bytes, peak_rss_bytes};
 use sdim::{
-    CompleteOptions, Completion, DepthScale, Device, Outliers, QueryPlan, Readout, RgbImage, SparseDepth,
-    WeightFormat, read_rgb,
+    CompleteOptions, Completion, DepthScale, Device, Outliers, QueryPlan, Readout, Region, RgbImage,
+    SparseDepth, WeightFormat, read_rgb,
 };
 use sensors::SensorArgs;
 use serde_json::{Value, json};
@@ -53,9 +53,15 @@ struct Args {
     /// How matrices are held: f32, bf16 or int8; without it, what this machine multiplies best.
     #[arg(long)]
     weights: Option<WeightFormat>,
-    /// Pixels to ask: every, stride:N or budget:N.
+    /// Pixels to ask: every, stride:N, budget:N or deadline:MS.
     #[arg(long, default_value_t = Default::default())]
     plan: QueryPlan,
+    /// Completes this part of the frame alone.
+    #[arg(long, value_name = "X,Y,WIDTH,HEIGHT", value_parser = region)]
+    region: Option<Region>,
+    /// Leaves out what would be farther than so many metres and is not measured.
+    #[arg(long, value_name = "METRES")]
+    far_limit: Option<f32>,
     /// What an answer's distribution is read as: median or mean.
     #[arg(long, default_value_t = Default::default())]
     readout: Readout,
@@ -109,6 +115,14 @@ impl Args {
     }
 }
 
+fn region(text: &str) -> Result<Region, String> {
+    let numbers: Vec<usize> = text.split(',').filter_map(|n| n.trim().parse().ok()).collect();
+    match numbers[..] {
+        [x, y, width, height] if text.split(',').count() == 4 => Ok(Region { x, y, width, height }),
+        _ => Err("expected four whole numbers: X,Y,WIDTH,HEIGHT".to_string()),
+    }
+}
+
 fn bar() -> anyhow::Result<ProgressBar> {
     let style = ProgressStyle::with_template("{bar:40} {pos}/{len} pixels asked, {eta} left")?;
     Ok(ProgressBar::new(0).with_style(style))
@@ -139,6 +153,7 @@ fn main() -> anyhow::Result<()> {
             ticker.set_length(p.planned as u64);
             ticker.set_position(p.answered as u64);
         });
+    (options.region, options.far_limit) = (args.region, args.far_limit);
     if let Some(megabytes) = args.max_memory {
         options = options.with_max_memory(megabytes.saturating_mul(1 << 20));
     }

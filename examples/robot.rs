@@ -24,7 +24,7 @@ struct Args {
     /// `tiny` (inside the crate) or a checkpoint directory.
     #[arg(long, default_value = "tiny")]
     model: String,
-    /// Pixels to ask: every, stride:N or budget:N.
+    /// Pixels to ask: every, stride:N, budget:N or deadline:MS.
     #[arg(long, default_value = "stride:8")]
     plan: QueryPlan,
     /// Points with less confidence are not published.

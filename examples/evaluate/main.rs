@@ -115,7 +115,7 @@ pub struct Args {
     /// all checkpoints loaded, so name one method to see what it needs alone.
     #[arg(long, value_delimiter = ',')]
     methods: Vec<String>,
-    /// Pixels to ask: every, stride:N or budget:N.
+    /// Pixels to ask: every, stride:N, budget:N or deadline:MS.
     #[arg(long, default_value_t = Default::default())]
     plan: QueryPlan,
     /// What an answer's distribution is read as: median or mean.
