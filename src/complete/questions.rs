@@ -7,7 +7,7 @@ use crate::depth::{DepthMap, SparseDepth, interpolate};
 use crate::error::Result;
 use crate::model::{AskOptions, Prefix, SdimModel, ask};
 use crate::query::{Hint, Query, Reading};
-use crate::refine::{Answered, FillInput};
+use crate::refine::{Answered, FillInput, Sampling};
 use image::RgbImage;
 
 /// Answers that lie at most so many pixels apart speak for the measurements between them, too.
@@ -165,7 +165,8 @@ impl<'a> Questions<'a> {
             false => &self.hint,
         };
         let input = FillInput { width, height, rgb: self.rgb, asked: &asked, sparse: self.sparse };
-        filter.apply(&input, interpolated, spacing)
+        let pixel = width as f32 / self.prefix.space.resized.0.max(1) as f32;
+        filter.apply(&input, interpolated, Sampling { spacing, pixel })
     }
 
     /// The dense map of what was answered so far: answers are aligned, read together and filled in between, measurements are kept.

@@ -9,33 +9,49 @@ use crate::error::{Error, Result};
 /// Weighted median filter: each answer becomes the median of the answers and measurements around it and of what the measurements
 /// say by linear interpolation, each weighted by nearness and by how sure it is.
 ///
-/// A median keeps edges and planes where they are, and an answer that is alone against its neighbours goes. The window has the
-/// standard deviation [`MedianFilter::sigma`] and ends 2.5 spacings from its middle; at the border of the frame it is cut on both
-/// sides alike, so that a slanted plane is not bent there. What it is worth: decision 059.
+/// A median keeps edges and planes where they are, and an answer that is alone against its neighbours goes, unless it is sure. The window is
+/// Gaussian; at the border of the frame it is cut on both sides alike, so that a slanted plane is not bent there. What it is worth: decision 060.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MedianFilter {
-    /// Standard deviation of the window, in spacings of the asked pixels.
+    /// Standard deviation of the window, in pixels of the frame as the model sees it.
     pub sigma: f32,
     /// What is added to an answer's expected error, relative to its depth, before it is weighed: how little a sure answer may
     /// outweigh another one.
     pub doubt: f32,
+    /// An answer whose expected error, relative to its depth, is no more than this is not outvoted by those around it.
+    pub sure: f32,
     /// Weight of the linear interpolation of the measurements, relative to that of all answers together; 0 for none.
     pub interpolated: f32,
 }
 
 impl Default for MedianFilter {
     fn default() -> Self {
-        Self { sigma: 1.5, doubt: 0.03, interpolated: 0.15 }
+        Self { sigma: 2.4, doubt: 0.03, sure: 0.02, interpolated: 0.15 }
     }
 }
 
 /// Pixels between the votes of a window are at least this many: what lies closer says the same, and takes time.
 const LEAST_SPACING: usize = 3;
 
-/// The window ends so many spacings from its middle.
+/// A window ends so many cells from its middle.
 const REACH: f32 = 2.5;
 
-/// Votes of one kind kept per cell of one spacing.
+/// A cell is at least this part of the window's standard deviation wide, so that a window does not end too early.
+const CELL: f32 = 0.75;
+
+/// How often an answer may outweigh all others around it.
+const MOST: f32 = 50.0;
+
+/// Where the asked pixels lie, and how finely the model saw the frame.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Sampling {
+    /// Distance between asked pixels where they lie least dense, pixels.
+    pub spacing: usize,
+    /// Pixels of the frame per pixel of what the model saw.
+    pub pixel: f32,
+}
+
+/// Votes of one kind kept per cell.
 const PER_CELL: usize = 2;
 
 /// One answer or measurement, as its neighbours see it.
@@ -48,7 +64,7 @@ struct Vote {
     error: f32,
 }
 
-/// What was said in a square of one spacing.
+/// What was said in a square.
 #[derive(Debug, Clone, Copy, Default)]
 struct Cell {
     answers: [Vote; PER_CELL],
@@ -126,15 +142,19 @@ impl From<&Answered> for Vote {
 }
 
 impl MedianFilter {
-    /// The answers of `input`, in their order, each read anew with its neighbours. `spacing` is the distance between asked pixels where
-    /// they lie least dense, pixels; `interpolated` the measurements interpolated linearly, `width * height` metres row by row,
-    /// or empty. Unreadable answers and those at measured pixels stay as they are.
+    /// The answers of `input`, in their order, each read anew with its neighbours. `interpolated` are the measurements interpolated linearly,
+    /// `width * height` metres row by row, or empty. Unreadable answers and those at measured pixels stay as they are.
     ///
     /// # Errors
-    /// [`Error::Argument`] for an option that is not a finite number of at least 0 (`sigma` and `doubt`: above 0), or for an answer outside
-    /// the frame; [`Error::BufferLength`]; [`Error::ImageSize`] for an empty frame.
-    pub fn apply(&self, input: &FillInput, interpolated: &[f32], spacing: usize) -> Result<Vec<Answered>> {
-        self.check()?;
+    /// [`Error::Argument`] for an option or a size of pixels that is not a finite number of at least 0 (`sigma`, `doubt` and the size: above 0),
+    /// or for an answer outside the frame; [`Error::BufferLength`]; [`Error::ImageSize`] for an empty frame.
+    pub fn apply(
+        &self,
+        input: &FillInput,
+        interpolated: &[f32],
+        sampling: Sampling,
+    ) -> Result<Vec<Answered>> {
+        self.check(sampling.pixel)?;
         let pixels = pixel_count(input.width, input.height)?;
         if !interpolated.is_empty() {
             check_length("interpolated depth", interpolated.len(), pixels)?;
@@ -143,23 +163,26 @@ impl MedianFilter {
             let expected = format!("x below {} and y below {}", input.width, input.height);
             return Err(Error::argument("answer", format!("({}, {})", a.x, a.y), expected));
         }
-        let spacing = spacing.max(1) * LEAST_SPACING.div_ceil(spacing.max(1));
-        let cells = Cells::new(input, spacing);
+        let deviation = self.sigma * sampling.pixel;
+        let cell = sampling.spacing.max((CELL * deviation).round() as usize).max(LEAST_SPACING);
+        let cells = Cells::new(input, cell.min(input.width.max(input.height)));
         let one = |votes: &mut Vec<(Vote, f32)>, a: &Answered| {
             if !is_valid(a.depth) || input.sparse.get(a.x, a.y).is_some() {
                 return *a;
             }
-            self.gather(votes, a, &cells, (input.width, input.height));
+            self.gather(votes, a, &cells, (input.width, input.height), deviation);
             let hint = interpolated.get(a.y * input.width + a.x).copied().filter(|d| is_valid(*d));
             self.elect(votes, a, hint)
         };
         Ok(input.asked.par_iter().map_init(Vec::new, one).collect())
     }
 
-    fn check(&self) -> Result<()> {
+    fn check(&self, pixel: f32) -> Result<()> {
         for (name, value, least) in [
             ("sigma", self.sigma, f32::MIN_POSITIVE),
             ("doubt", self.doubt, f32::MIN_POSITIVE),
+            ("pixel", pixel, f32::MIN_POSITIVE),
+            ("sure", self.sure, 0.0),
             ("interpolated", self.interpolated, 0.0),
         ] {
             if !(value.is_finite() && value >= least) {
@@ -172,11 +195,18 @@ impl MedianFilter {
     }
 
     /// Fills `votes` with what is said around an answer, itself included, and with the weight of each.
-    fn gather(&self, votes: &mut Vec<(Vote, f32)>, a: &Answered, cells: &Cells, size: (usize, usize)) {
+    fn gather(
+        &self,
+        votes: &mut Vec<(Vote, f32)>,
+        a: &Answered,
+        cells: &Cells,
+        size: (usize, usize),
+        deviation: f32,
+    ) {
         votes.clear();
         let own = Vote::from(a);
-        votes.push((own, 1.0 / (self.doubt + own.error / own.depth)));
-        let (reach, deviation) = (REACH * cells.spacing as f32, self.sigma * cells.spacing as f32);
+        let reach = REACH * cells.spacing as f32;
+        let mut others = 0.0;
         for vote in cells.around(a.x, a.y) {
             let (dx, dy) = (vote.x as f32 - a.x as f32, vote.y as f32 - a.y as f32);
             let inside = |at: usize, step: f32, size: usize| (0.0..size as f32).contains(&(at as f32 - step));
@@ -185,8 +215,13 @@ impl MedianFilter {
                 continue;
             }
             let near = (-0.5 * (dx * dx + dy * dy) / (deviation * deviation)).exp();
-            votes.push((*vote, near / (self.doubt + vote.error / vote.depth)));
+            let weight = near / (self.doubt + vote.error / vote.depth);
+            others += weight;
+            votes.push((*vote, weight));
         }
+        let unsure = own.error / own.depth;
+        let say = others * (self.sure / unsure).min(MOST);
+        votes.push((own, say.max(1.0 / (self.doubt + unsure))));
     }
 
     fn elect(&self, votes: &mut [(Vote, f32)], a: &Answered, interpolated: Option<f32>) -> Answered {

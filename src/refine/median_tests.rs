@@ -20,7 +20,12 @@ fn apply(
     let rgb = RgbImage::new(SIZE.0 as u32, SIZE.1 as u32);
     let sparse = SparseDepth::from_points(SIZE.0, SIZE.1, points).unwrap();
     let input = FillInput { width: SIZE.0, height: SIZE.1, rgb: &rgb, asked, sparse: &sparse };
-    filter.apply(&input, &[], spacing).unwrap()
+    filter.apply(&input, &[], at(spacing)).unwrap()
+}
+
+/// Pixels asked so far apart, in a frame that the model saw so that the window is 1.5 times as wide.
+fn at(spacing: usize) -> Sampling {
+    Sampling { spacing, pixel: 1.5 * spacing.max(3) as f32 / 2.4 }
 }
 
 fn filtered(asked: &[Answered], spacing: usize) -> Vec<Answered> {
@@ -84,6 +89,17 @@ fn sure_answers_and_measurements_outweigh_unsure_ones() {
 }
 
 #[test]
+fn a_sure_answer_is_not_outvoted() {
+    let mut asked = lattice(4, |_, _| 3.0);
+    let middle = asked.iter().position(|a| (a.x, a.y) == (32, 24)).unwrap();
+    asked[middle].depth = 2.0;
+    asked[middle].expected_error = 2.0 * 0.019;
+    assert_eq!(filtered(&asked, 4)[middle].depth, 2.0, "a thin thing that was seen");
+    asked[middle].expected_error = 2.0 * 0.03;
+    assert_eq!(filtered(&asked, 4)[middle].depth, 3.0);
+}
+
+#[test]
 fn the_interpolation_has_the_say_that_it_is_given() {
     let mut asked = lattice(4, |x, _| if x % 8 == 0 { 2.0 } else { 3.0 });
     asked.iter_mut().for_each(|a| a.expected_error = 0.1 * a.depth);
@@ -92,7 +108,7 @@ fn the_interpolation_has_the_say_that_it_is_given() {
     let input = FillInput { width: SIZE.0, height: SIZE.1, rgb: &rgb, asked: &asked, sparse: &sparse };
     let with = |share: f32, depth: f32| {
         let filter = MedianFilter { interpolated: share, ..Default::default() };
-        let out = filter.apply(&input, &vec![depth; SIZE.0 * SIZE.1], 4).unwrap();
+        let out = filter.apply(&input, &vec![depth; SIZE.0 * SIZE.1], at(4)).unwrap();
         out.iter().find(|a| (a.x, a.y) == (32, 24)).unwrap().depth
     };
     // Columns of 2 m and of 3 m have about the same weight, so a little more decides.
@@ -137,12 +153,13 @@ fn unreadable_answers_and_measured_pixels_stay_and_bad_input_is_an_error() {
     asked[3].x = SIZE.0;
     let input = FillInput { width: SIZE.0, height: SIZE.1, rgb: &rgb, asked: &asked, sparse: &sparse };
     let filter = MedianFilter::default();
-    assert!(matches!(filter.apply(&input, &[], 4), Err(Error::Argument { .. })));
+    assert!(matches!(filter.apply(&input, &[], at(4)), Err(Error::Argument { .. })));
     let input = FillInput { asked: &[], ..input };
-    assert!(matches!(filter.apply(&input, &[1.0; 3], 4), Err(Error::BufferLength { .. })));
+    assert!(matches!(filter.apply(&input, &[1.0; 3], at(4)), Err(Error::BufferLength { .. })));
     for bad in [f32::NAN, f32::INFINITY, 0.0, -1.0] {
-        assert!(MedianFilter { sigma: bad, ..filter }.apply(&input, &[], 4).is_err());
-        assert!(MedianFilter { doubt: bad, ..filter }.apply(&input, &[], 4).is_err());
+        assert!(MedianFilter { sigma: bad, ..filter }.apply(&input, &[], at(4)).is_err());
+        assert!(MedianFilter { doubt: bad, ..filter }.apply(&input, &[], at(4)).is_err());
+        assert!(filter.apply(&input, &[], Sampling { pixel: bad, ..at(4) }).is_err());
     }
-    assert!(filter.apply(&input, &[], 0).is_ok_and(|out| out.is_empty()));
+    assert!(filter.apply(&input, &[], at(0)).is_ok_and(|out| out.is_empty()));
 }

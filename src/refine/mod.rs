@@ -5,7 +5,7 @@ mod median;
 mod surfaces;
 
 pub use fill::{Answered, Fill, FillInput, Filled};
-pub use median::MedianFilter;
+pub use median::{MedianFilter, Sampling};
 pub use surfaces::EdgeAwareFill;
 
 use rayon::prelude::*;
