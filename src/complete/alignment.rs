@@ -1,9 +1,9 @@
 //! The difference between measurements and answers, carried over to the answers around.
 
 use crate::depth::interpolate::Interpolator;
+use crate::depth::pixels::CONFIDENT_WITHIN;
 use crate::error::Result;
 use crate::query::Reading;
-use crate::query::reading::CONFIDENT_WITHIN;
 
 /// An aligned answer is at least and at most this many times the answer itself. Measured on 30 procedural scenes and 13 real
 /// frames, 100 to 1500 points: a tighter upper limit loses on frames whose far parts the model draws too near (a street: MAE

@@ -2,7 +2,7 @@
 
 use crate::error::{Error, Result};
 use crate::query::{AnswerMode, QueryPlan, Readout};
-use crate::refine::{EdgeAwareFill, Fill};
+use crate::refine::{EdgeAwareFill, Fill, MedianFilter};
 use std::str::FromStr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -109,6 +109,8 @@ pub struct CompleteOptions {
     /// Bytes that a batch of queries may take beside the weights and the frame, about; smaller batches are slower and give
     /// the same answers. `None` for batches of 2048 rows.
     pub max_memory: Option<usize>,
+    /// How answers are read together with those around them; `None` to take each as it is.
+    pub filter: Option<MedianFilter>,
     /// How pixels that were not asked are filled.
     pub fill: Arc<dyn Fill>,
     /// Told after each batch.
@@ -127,6 +129,7 @@ impl Default for CompleteOptions {
             readout: Readout::default(),
             align: true,
             max_memory: None,
+            filter: Some(MedianFilter::default()),
             fill: Arc::new(EdgeAwareFill::default()),
             progress: None,
             cancel: None,
@@ -144,6 +147,7 @@ impl std::fmt::Debug for CompleteOptions {
             .field("readout", &self.readout)
             .field("align", &self.align)
             .field("max_memory", &self.max_memory)
+            .field("filter", &self.filter)
             .finish_non_exhaustive()
     }
 }
@@ -188,6 +192,12 @@ impl CompleteOptions {
     /// With batches of queries that take about this many bytes.
     pub fn with_max_memory(mut self, bytes: usize) -> Self {
         self.max_memory = Some(bytes);
+        self
+    }
+
+    /// With answers read together with those around them, or (`None`) each as it is.
+    pub fn with_filter(mut self, filter: Option<MedianFilter>) -> Self {
+        self.filter = filter;
         self
     }
 

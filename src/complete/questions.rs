@@ -90,11 +90,7 @@ impl<'a> Questions<'a> {
     /// Asks the plan's pixels and those of the alignment.
     pub(super) fn ask_all(&self) -> Result<Answers> {
         let (width, height) = (self.sparse.width(), self.sparse.height());
-        let stride = match self.options.plan {
-            QueryPlan::Every => 1,
-            QueryPlan::Stride(n) => n,
-            QueryPlan::Budget(n) => stride_within(width, height, n.min(width * height).div_ceil(2)),
-        };
+        let stride = self.stride();
         let first = lattice(width, height, stride);
         let coarse: Vec<_> = first.iter().copied().filter(|&p| self.wanted(p)).collect();
         let all = match self.options.preserve {
@@ -129,6 +125,16 @@ impl<'a> Questions<'a> {
         Ok(Answers { readings: pixels.into_iter().zip(readings).collect(), anchors: beside, asked })
     }
 
+    /// The stride of the lattice that the plan asks first.
+    fn stride(&self) -> usize {
+        let (width, height) = (self.sparse.width(), self.sparse.height());
+        match self.options.plan {
+            QueryPlan::Every => 1,
+            QueryPlan::Stride(n) => n,
+            QueryPlan::Budget(n) => stride_within(width, height, n.min(width * height).div_ceil(2)),
+        }
+    }
+
     /// Where the rest of a budget goes.
     fn refinement(
         &self,
@@ -151,7 +157,21 @@ impl<'a> Questions<'a> {
         refine_pixels(width, height, stride, &answers, budget, |x, y| self.wanted((x, y)))
     }
 
-    /// Aligns the answers, fills the rest, keeps the measurements; and says what is expected at the flagged ones, which are kept
+    /// The answers, read together with those around them. Measurements have a say also where they are not kept.
+    fn filtered(&self, rgb: &RgbImage, asked: Vec<Answered>) -> Result<Vec<Answered>> {
+        let Some(filter) = &self.options.filter else {
+            return Ok(asked);
+        };
+        let (width, height) = (self.sparse.width(), self.sparse.height());
+        let interpolated = match self.hint.is_empty() {
+            true => &interpolate::linear(self.sparse)?,
+            false => &self.hint,
+        };
+        let input = FillInput { width, height, rgb, asked: &asked, sparse: self.sparse };
+        filter.apply(&input, interpolated, self.stride())
+    }
+
+    /// Aligns the answers, reads them together, fills the rest, keeps the measurements; and says what is expected at the flagged ones, which are kept
     /// where the caller insists.
     pub(super) fn dense(
         &self,
@@ -180,6 +200,7 @@ impl<'a> Questions<'a> {
             .collect();
         let none = SparseDepth::from_points(width, height, &[])?;
         let kept = if self.options.preserve == Preserve::Keep { self.sparse } else { &none };
+        let asked = self.filtered(rgb, asked)?;
         let input = FillInput { width, height, rgb, asked: &asked, sparse: kept };
         let mut filled = self.options.fill.fill(&input)?;
         let expected = |&(x, y, measured): &(usize, usize, f32)| Outlier {

@@ -4,6 +4,9 @@ use crate::error::{Error, Result};
 use image::RgbImage;
 use ndarray::ArrayView2;
 
+/// A confidence is the probability that the truth lies within this share of the depth.
+pub(crate) const CONFIDENT_WITHIN: f32 = 0.05;
+
 /// `width * height`, refusing empty images and products that overflow.
 pub(crate) fn pixel_count(width: usize, height: usize) -> Result<usize> {
     let reason = match width.checked_mul(height) {

@@ -2,11 +2,12 @@
 
 use super::batch::Batch;
 use super::sdim_model::SdimModel;
+use crate::depth::pixels::CONFIDENT_WITHIN;
 use crate::error::{Error, Result};
 use crate::query::grammar::AnswerGrammar;
 use crate::query::mode::Generation;
 use crate::query::number::NumberFormat;
-use crate::query::reading::{CONFIDENT_WITHIN, Reading};
+use crate::query::reading::Reading;
 use crate::vlm::chat::tokenizer::Tokenizer;
 use candle_core::{DType, Device, Tensor};
 use candle_transformers::utils::apply_repeat_penalty;

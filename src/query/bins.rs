@@ -1,6 +1,7 @@
 //! Where numbers lie among the bins of a vocabulary.
 
-use super::reading::{CONFIDENT_WITHIN, Reading, Readout};
+use super::reading::{Reading, Readout};
+use crate::depth::pixels::CONFIDENT_WITHIN;
 use crate::kernels::{BinStats, Middle, bin_stats};
 
 /// The bins of a [`NumberFormat`](super::number::NumberFormat). A position counts bins from 0: bin `k` covers `k` to `k + 1`.

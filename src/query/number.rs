@@ -1,8 +1,9 @@
 //! Numbers as tokens: how a depth is written into a prompt, and how an answer is read from logits.
 
 use super::bins::{Bins, Spacing};
-use super::reading::{CONFIDENT_WITHIN, Reading};
+use super::reading::Reading;
 use crate::depth::SparseDepth;
+use crate::depth::pixels::CONFIDENT_WITHIN;
 use crate::error::{Error, Result};
 use crate::vlm::chat::tokenizer::Tokenizer;
 

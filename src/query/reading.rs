@@ -54,6 +54,3 @@ impl Reading {
     /// No readable number.
     pub const INVALID: Self = Self { value: f32::NAN, confidence: 0.0, expected_error: f32::NAN };
 }
-
-/// Half-width of the interval whose probability is the confidence, relative to the answer.
-pub(crate) const CONFIDENT_WITHIN: f32 = 0.05;

@@ -1,9 +1,11 @@
 //! From the pixels that were answered to a map with a value at every pixel.
 
 mod fill;
+mod median;
 mod surfaces;
 
 pub use fill::{Answered, Fill, FillInput, Filled};
+pub use median::MedianFilter;
 pub use surfaces::EdgeAwareFill;
 
 use rayon::prelude::*;
@@ -115,5 +117,7 @@ fn rim(depth: &[f32], width: usize, height: usize) -> Vec<usize> {
     (0..depth.len()).into_par_iter().filter(at_a_hole).collect()
 }
 
+#[cfg(test)]
+mod median_tests;
 #[cfg(test)]
 mod tests;
