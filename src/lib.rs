@@ -117,8 +117,8 @@ pub use self::image::read_rgb;
 pub use ::image::RgbImage;
 pub use candle_core::{Device, Tensor};
 pub use complete::{
-    CancelToken, CompleteOptions, Completion, DepthCompleter, Outliers, Preserve, Progress, ProgressCallback,
-    StageSeconds,
+    CancelToken, CompleteOptions, Completion, DepthCompleter, Outliers, Partial, Preserve, PreviewCallback,
+    Progress, ProgressCallback, Region, StageSeconds,
 };
 pub use depth::{DepthMap, DepthScale, Intrinsics, SparseDepth};
 pub use error::{Error, Result};

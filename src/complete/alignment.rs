@@ -16,7 +16,7 @@ const BOUND: (f32, f32) = (0.5, 3.0);
 const SAME_SURFACE: f32 = 0.1;
 
 /// Answers at measured pixels, beside the measurements.
-#[derive(Default)]
+#[derive(Clone, Default)]
 pub(super) struct Anchors {
     /// Columns and rows.
     points: Vec<(f32, f32)>,

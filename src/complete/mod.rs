@@ -3,21 +3,30 @@
 mod alignment;
 mod belief;
 mod options;
+mod pace;
 mod questions;
+mod schedule;
 mod stages;
 
-pub use options::{CancelToken, CompleteOptions, Outliers, Preserve, Progress, ProgressCallback};
+pub use options::{
+    CancelToken, CompleteOptions, Outliers, Partial, Preserve, PreviewCallback, Progress, ProgressCallback,
+    Region,
+};
 pub use stages::StageSeconds;
 
 use crate::depth::outliers::Outlier;
 use crate::depth::{DepthMap, SparseDepth};
 use crate::error::{Error, Result};
 use crate::model::SdimModel;
+use crate::query::QueryPlan;
+use crate::refine::Answered;
 use crate::vlm::checkpoint::LoadOptions;
 use crate::vlm::qwen2_5::preprocess::MAX_RATIO;
 use belief::believe;
 use image::RgbImage;
+use pace::{Clock, Pace};
 use questions::Questions;
+use std::collections::HashMap;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
@@ -43,6 +52,7 @@ const MIN_SIDE: usize = 28;
 #[derive(Clone)]
 pub struct DepthCompleter {
     model: Arc<SdimModel>,
+    pace: Arc<Pace>,
 }
 
 impl DepthCompleter {
@@ -76,7 +86,7 @@ impl DepthCompleter {
     /// Wraps a model.
     #[doc(hidden)]
     pub fn new(model: SdimModel) -> Self {
-        Self { model: Arc::new(model) }
+        Self { model: Arc::new(model), pace: Arc::default() }
     }
 
     /// The model.
@@ -125,6 +135,99 @@ impl DepthCompleter {
         options: &CompleteOptions,
     ) -> Result<Completion> {
         let start = Instant::now();
+        self.check(rgb, sparse, options)?;
+        let pixels = sparse.width() * sparse.height();
+        let pace = self.pace.seconds();
+        let clock = match options.plan {
+            QueryPlan::Deadline(time) => Some(Clock::new(start, time)),
+            _ => None,
+        };
+        let needed = (pace.prefix.unwrap_or(0.0) + pace.refine) * pixels as f64;
+        if clock.is_some_and(|clock| clock.left() < needed) {
+            return Ok(Completion::interpolated(sparse, options, start)?);
+        }
+        let mut seconds = StageSeconds::default();
+        let _span =
+            tracing::info_span!("complete", width = sparse.width(), height = sparse.height()).entered();
+        let believed = believe(&self.model, rgb, sparse, options, &mut seconds)?;
+        let span = tracing::info_span!("queries").entered();
+        let mark = Instant::now();
+        let questions = Questions::new(&self.model, rgb, &believed, options)?;
+        let answers = questions.ask_all(clock, pace)?;
+        drop(span);
+        seconds.queries = mark.elapsed().as_secs_f64();
+        let _refine = tracing::info_span!("refine").entered();
+        let mark = Instant::now();
+        let asked = answers.asked + believed.asked;
+        if answers.asked == 0 && clock.is_some() {
+            let late = Completion::interpolated(&believed.sparse, options, start)?;
+            self.pace.learn(pixels, &seconds, 0);
+            return Ok(Completion {
+                asked,
+                seconds: StageSeconds { total: late.seconds.total, ..seconds },
+                ..late
+            });
+        }
+        let (map, flagged) = questions.dense(&answers)?;
+        seconds.refine = mark.elapsed().as_secs_f64();
+        self.pace.learn(pixels, &seconds, answers.asked);
+        seconds.total = start.elapsed().as_secs_f64();
+        Ok(Completion { map, asked, flagged, seconds })
+    }
+
+    /// How far some pixels are, without the rest of the frame: `pixels` are (column, row), the answers come in their order, in metres. A
+    /// measured pixel gives its measurement where measurements are kept, with confidence 1; one whose answer cannot be read has
+    /// depth NaN and confidence 0. Answers are aligned to the measurements as in a map, but there are no neighbours to read them with; plan,
+    /// filter, fill, region, far limit and preview of the options say nothing here.
+    ///
+    /// ```
+    /// # use sdim::{CompleteOptions, DepthCompleter, RgbImage, SparseDepth};
+    /// # #[cfg(feature = "tiny")] {
+    /// let completer = DepthCompleter::tiny()?;
+    /// let sparse = SparseDepth::from_points(64, 48, &[(5, 5, 2.0), (60, 8, 2.5), (30, 40, 1.2)])?;
+    /// let answers = completer.complete_at(&RgbImage::new(64, 48), &sparse, &[(31, 20), (60, 8)], &CompleteOptions::default())?;
+    /// assert!(answers[0].depth > 0.0);
+    /// assert_eq!((answers[1].depth, answers[1].confidence), (2.5, 1.0));
+    /// # }
+    /// # Ok::<(), sdim::Error>(())
+    /// ```
+    ///
+    /// # Errors
+    /// [`Error::Argument`] for a pixel outside the frame; as [`DepthCompleter::complete`].
+    pub fn complete_at(
+        &self,
+        rgb: &RgbImage,
+        sparse: &SparseDepth,
+        pixels: &[(usize, usize)],
+        options: &CompleteOptions,
+    ) -> Result<Vec<Answered>> {
+        let options = CompleteOptions { region: None, ..options.clone() };
+        self.check(rgb, sparse, &options)?;
+        if let Some((x, y)) = pixels.iter().find(|(x, y)| *x >= sparse.width() || *y >= sparse.height()) {
+            let expected = format!("a column below {} and a row below {}", sparse.width(), sparse.height());
+            return Err(Error::argument("pixel", format!("({x}, {y})"), expected));
+        }
+        let believed = believe(&self.model, rgb, sparse, &options, &mut StageSeconds::default())?;
+        let questions = Questions::new(&self.model, rgb, &believed, &options)?;
+        let answers = questions.ask_pixels(pixels)?;
+        let said: HashMap<(usize, usize), Answered> =
+            questions.aligned(&answers)?.into_iter().map(|a| ((a.x, a.y), a)).collect();
+        let one = |&(x, y): &(usize, usize)| match believed
+            .sparse
+            .get(x, y)
+            .filter(|_| !questions.wanted((x, y)))
+        {
+            Some(depth) => Answered { x, y, depth, confidence: 1.0, expected_error: 0.0 },
+            None => {
+                let unread = Answered { x, y, depth: f32::NAN, confidence: 0.0, expected_error: f32::NAN };
+                said.get(&(x, y)).copied().unwrap_or(unread)
+            }
+        };
+        Ok(pixels.iter().map(one).collect())
+    }
+
+    /// Whether a frame and the options go together and with the checkpoint.
+    fn check(&self, rgb: &RgbImage, sparse: &SparseDepth, options: &CompleteOptions) -> Result<()> {
         let size = (rgb.width() as usize, rgb.height() as usize);
         if size != (sparse.width(), sparse.height()) {
             return Err(Error::SizeMismatch { rgb: size, depth: (sparse.width(), sparse.height()) });
@@ -139,21 +242,23 @@ impl DepthCompleter {
         if let Some(mode) = &options.answer {
             self.model.prompts.settings().validate_mode("CompleteOptions", mode)?;
         }
-        let mut seconds = StageSeconds::default();
-        let _span = tracing::info_span!("complete", width = size.0, height = size.1).entered();
-        let believed = believe(&self.model, rgb, sparse, options, &mut seconds)?;
-        let span = tracing::info_span!("queries").entered();
-        let mark = Instant::now();
-        let questions = Questions::new(&self.model, &believed.prefix, &believed.sparse, options)?;
-        let answers = questions.ask_all()?;
-        drop(span);
-        seconds.queries = mark.elapsed().as_secs_f64();
-        let _refine = tracing::info_span!("refine").entered();
-        let mark = Instant::now();
-        let asked = answers.asked + believed.asked;
-        let (map, flagged) = questions.dense(rgb, answers, &believed.flagged)?;
-        seconds.refine = mark.elapsed().as_secs_f64();
-        seconds.total = start.elapsed().as_secs_f64();
-        Ok(Completion { map, asked, flagged, seconds })
+        if let Some(region) = &options.region {
+            region.check(size.0, size.1)?;
+        }
+        match options.far_limit {
+            Some(far) if !(far.is_finite() && far > 0.0) => {
+                Err(Error::argument("far_limit", far, "a finite number of metres above 0"))
+            }
+            _ => Ok(()),
+        }
+    }
+}
+
+impl Completion {
+    /// For want of time: the measurements, interpolated.
+    fn interpolated(sparse: &SparseDepth, options: &CompleteOptions, start: Instant) -> Result<Self> {
+        let map = questions::interpolated(sparse, options)?;
+        let seconds = StageSeconds { total: start.elapsed().as_secs_f64(), ..Default::default() };
+        Ok(Self { map, asked: 0, flagged: Vec::new(), seconds })
     }
 }

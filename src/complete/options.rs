@@ -1,5 +1,6 @@
 //! How a frame is completed.
 
+use crate::depth::DepthMap;
 use crate::error::{Error, Result};
 use crate::query::{AnswerMode, QueryPlan, Readout};
 use crate::refine::{EdgeAwareFill, Fill, MedianFilter};
@@ -79,6 +80,74 @@ impl CancelToken {
     }
 }
 
+/// A rectangle of pixels.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Region {
+    /// First column.
+    pub x: usize,
+    /// First row.
+    pub y: usize,
+    /// Columns.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+}
+
+impl Region {
+    /// Whether a pixel lies inside.
+    pub fn contains(&self, x: usize, y: usize) -> bool {
+        let inside = |at: usize, from: usize, size: usize| at >= from && at - from < size;
+        inside(x, self.x, self.width) && inside(y, self.y, self.height)
+    }
+
+    /// How many pixels it has.
+    pub(crate) fn pixels(&self) -> usize {
+        self.width * self.height
+    }
+
+    /// Fails unless it has pixels and lies in a frame.
+    pub(crate) fn check(&self, width: usize, height: usize) -> Result<()> {
+        let fits = |from: usize, size: usize, all: usize| size > 0 && from < all && size <= all - from;
+        if fits(self.x, self.width, width) && fits(self.y, self.height, height) {
+            return Ok(());
+        }
+        let found = format!("{}x{} at ({}, {})", self.width, self.height, self.x, self.y);
+        Err(Error::argument(
+            "region",
+            found,
+            format!("at least one pixel, inside of a frame of {width}x{height}"),
+        ))
+    }
+}
+
+/// A frame that is not done yet.
+pub struct Partial<'a> {
+    progress: Progress,
+    map: &'a dyn Fn() -> Result<DepthMap>,
+}
+
+impl<'a> Partial<'a> {
+    pub(super) fn new(progress: Progress, map: &'a dyn Fn() -> Result<DepthMap>) -> Self {
+        Self { progress, map }
+    }
+
+    /// How far it is.
+    pub fn progress(&self) -> Progress {
+        self.progress
+    }
+
+    /// The whole map, as far as it is known by now. It takes the time of a frame's refinement.
+    ///
+    /// # Errors
+    /// As [`crate::DepthCompleter::complete`].
+    pub fn map(&self) -> Result<DepthMap> {
+        (self.map)()
+    }
+}
+
+/// Called with what is known of a frame after each few thousand answers.
+pub type PreviewCallback = Arc<dyn Fn(&Partial) + Send + Sync>;
+
 /// Called after each batch of answers.
 pub type ProgressCallback = Arc<dyn Fn(Progress) + Send + Sync>;
 
@@ -113,6 +182,13 @@ pub struct CompleteOptions {
     pub filter: Option<MedianFilter>,
     /// How pixels that were not asked are filled.
     pub fill: Arc<dyn Fill>,
+    /// The part of the frame that is completed, `None` for all of it; pixels outside are invalid, measured ones excepted. The model sees the
+    /// whole frame and all measurements in any case.
+    pub region: Option<Region>,
+    /// Pixels that are not measured and would be farther than this, metres, are invalid instead: a sky has no depth.
+    pub far_limit: Option<f32>,
+    /// Shown the map so far. Pixels are then asked in an order in which those of any moment are spread over the frame.
+    pub preview: Option<PreviewCallback>,
     /// Told after each batch.
     pub progress: Option<ProgressCallback>,
     /// Checked after each batch.
@@ -131,6 +207,9 @@ impl Default for CompleteOptions {
             max_memory: None,
             filter: Some(MedianFilter::default()),
             fill: Arc::new(EdgeAwareFill::default()),
+            region: None,
+            far_limit: None,
+            preview: None,
             progress: None,
             cancel: None,
         }
@@ -148,6 +227,8 @@ impl std::fmt::Debug for CompleteOptions {
             .field("align", &self.align)
             .field("max_memory", &self.max_memory)
             .field("filter", &self.filter)
+            .field("region", &self.region)
+            .field("far_limit", &self.far_limit)
             .finish_non_exhaustive()
     }
 }
@@ -204,6 +285,24 @@ impl CompleteOptions {
     /// With another way to fill what was not asked.
     pub fn with_fill(mut self, fill: impl Fill + 'static) -> Self {
         self.fill = Arc::new(fill);
+        self
+    }
+
+    /// With a part of the frame.
+    pub fn with_region(mut self, region: Region) -> Self {
+        self.region = Some(region);
+        self
+    }
+
+    /// With pixels beyond so many metres invalid.
+    pub fn with_far_limit(mut self, metres: f32) -> Self {
+        self.far_limit = Some(metres);
+        self
+    }
+
+    /// With a function that is shown the map while it grows.
+    pub fn with_preview(mut self, preview: impl Fn(&Partial) + Send + Sync + 'static) -> Self {
+        self.preview = Some(Arc::new(preview));
         self
     }
 

@@ -1,37 +1,37 @@
-//! The questions about one frame: which pixels are asked, the alignment of their answers to the measurements, and the dense
-//! map that comes of both.
+//! The questions about one frame, the alignment of their answers to the measurements, and the dense map that comes of both.
 
 use super::alignment::{Alignment, Anchors};
-use super::options::{CancelToken, CompleteOptions, Outliers, Preserve, Progress};
+use super::options::{CancelToken, CompleteOptions, Outliers, Preserve, Progress, Region};
 use crate::depth::outliers::Outlier;
 use crate::depth::{DepthMap, SparseDepth, interpolate};
 use crate::error::Result;
 use crate::model::{AskOptions, Prefix, SdimModel, ask};
-use crate::query::plan::{Asked, lattice, refine_pixels, stride_within};
-use crate::query::told::choose_evenly;
-use crate::query::{Hint, Query, QueryPlan, Reading};
+use crate::query::{Hint, Query, Reading};
 use crate::refine::{Answered, FillInput};
 use image::RgbImage;
 
-/// Measurements asked for the alignment, at most; more are chosen spatially even.
-const ALIGN_POINTS: usize = 2048;
-
 /// What was answered in a frame.
+#[derive(Default)]
 pub(super) struct Answers {
     /// The plan's pixels.
-    readings: Vec<((usize, usize), Reading)>,
+    pub(super) readings: Vec<((usize, usize), Reading)>,
     /// Measured pixels that were asked for the alignment.
-    anchors: Anchors,
+    pub(super) anchors: Anchors,
     /// Pixels asked, those for the alignment included.
     pub(super) asked: usize,
+    /// Distance between the plan's pixels where they lie least dense.
+    pub(super) spacing: usize,
 }
 
 /// The questions about one frame.
 pub(super) struct Questions<'a> {
     model: &'a SdimModel,
     prefix: &'a Prefix,
-    sparse: &'a SparseDepth,
-    options: &'a CompleteOptions,
+    pub(super) rgb: &'a RgbImage,
+    pub(super) sparse: &'a SparseDepth,
+    /// Measurements that are not believed: column, row, metres.
+    flagged: &'a [(usize, usize, f32)],
+    pub(super) options: &'a CompleteOptions,
     /// Linear interpolation of all measurements, metres; empty if the checkpoint takes no hint.
     hint: Vec<f32>,
 }
@@ -39,15 +39,26 @@ pub(super) struct Questions<'a> {
 impl<'a> Questions<'a> {
     pub(super) fn new(
         model: &'a SdimModel,
-        prefix: &'a Prefix,
-        sparse: &'a SparseDepth,
+        rgb: &'a RgbImage,
+        believed: &'a super::belief::Believed<'a>,
         options: &'a CompleteOptions,
     ) -> Result<Self> {
+        let (prefix, sparse, flagged) = (&believed.prefix, &*believed.sparse, &*believed.flagged);
         let hint = match model.prompts.settings().hint {
             Hint::Linear => interpolate::linear(sparse)?,
             Hint::None => Vec::new(),
         };
-        Ok(Self { model, prefix, sparse, options, hint })
+        Ok(Self { model, prefix, rgb, sparse, flagged, options, hint })
+    }
+
+    pub(super) fn size(&self) -> (usize, usize) {
+        (self.sparse.width(), self.sparse.height())
+    }
+
+    /// The part of the frame that is completed.
+    pub(super) fn region(&self) -> Region {
+        let (width, height) = self.size();
+        self.options.region.unwrap_or(Region { x: 0, y: 0, width, height })
     }
 
     /// What is asked at a pixel; `tell` states its measurement where the template has a place for it.
@@ -57,8 +68,9 @@ impl<'a> Questions<'a> {
     }
 
     /// Whether a pixel of a plan needs an answer: measured ones do not, where they are kept.
-    fn wanted(&self, (x, y): (usize, usize)) -> bool {
-        self.options.preserve != Preserve::Keep || self.sparse.get(x, y).is_none()
+    pub(super) fn wanted(&self, (x, y): (usize, usize)) -> bool {
+        let kept = self.options.preserve == Preserve::Keep && self.sparse.get(x, y).is_some();
+        !kept && self.region().contains(x, y)
     }
 
     /// Whether a pixel's own question states its measurement, so that the answer repeats it: what was answered at the pixels
@@ -67,6 +79,7 @@ impl<'a> Questions<'a> {
         self.model.prompts.states_measurement(&self.query(pixel, true))
     }
 
+    /// Asks at pixels; `before` were answered before them, `planned` will be in all.
     fn ask(
         &self,
         pixels: &[(usize, usize)],
@@ -87,121 +100,79 @@ impl<'a> Questions<'a> {
         ask(self.model, self.prefix, &queries, options)
     }
 
-    /// Asks the plan's pixels and those of the alignment.
-    pub(super) fn ask_all(&self) -> Result<Answers> {
-        let (width, height) = (self.sparse.width(), self.sparse.height());
-        let stride = self.stride();
-        let first = lattice(width, height, stride);
-        let coarse: Vec<_> = first.iter().copied().filter(|&p| self.wanted(p)).collect();
-        let all = match self.options.preserve {
-            Preserve::Keep => width * height - self.sparse.measured(),
-            Preserve::Ask => width * height,
-        };
-        let budget = match self.options.plan {
-            QueryPlan::Budget(n) => n.min(all).saturating_sub(coarse.len()),
-            QueryPlan::Every | QueryPlan::Stride(_) => 0,
-        };
-        let anchors = match self.options.align && coarse.len() + budget > 0 {
-            true => choose_evenly(self.sparse, ALIGN_POINTS, 0),
-            false => Vec::new(),
-        };
-        let planned = coarse.len() + budget + anchors.len();
-        let mut pixels = coarse;
-        let mut readings = self.ask(&pixels, true, 0, planned)?;
-        if budget > 0 {
-            let more = self.refinement(&first, stride, &pixels, &readings, budget);
-            let planned = pixels.len() + more.len() + anchors.len();
-            readings.extend(self.ask(&more, true, pixels.len(), planned)?);
-            pixels.extend(more);
-        }
-        let anchor_pixels: Vec<(usize, usize)> = anchors.iter().map(|a| (a.0, a.1)).collect();
-        // An answer that was told its measurement would only repeat it.
-        let said = self.ask(&anchor_pixels, false, pixels.len(), pixels.len() + anchors.len())?;
-        let asked = pixels.len() + said.len();
-        let mut beside = Anchors::default();
-        for (anchor, reading) in anchors.into_iter().zip(&said) {
-            beside.push(anchor, reading);
-        }
-        Ok(Answers { readings: pixels.into_iter().zip(readings).collect(), anchors: beside, asked })
-    }
-
-    /// The stride of the lattice that the plan asks first.
-    fn stride(&self) -> usize {
-        let (width, height) = (self.sparse.width(), self.sparse.height());
-        match self.options.plan {
-            QueryPlan::Every => 1,
-            QueryPlan::Stride(n) => n,
-            QueryPlan::Budget(n) => stride_within(width, height, n.min(width * height).div_ceil(2)),
-        }
-    }
-
-    /// Where the rest of a budget goes.
-    fn refinement(
+    /// Asks at pixels of the plan.
+    pub(super) fn ask_plan(
         &self,
-        first: &[(usize, usize)],
-        stride: usize,
-        asked: &[(usize, usize)],
-        readings: &[Reading],
-        budget: usize,
-    ) -> Vec<(usize, usize)> {
-        let mut next = asked.iter().zip(readings).peekable();
-        let answers: Vec<Asked> = first
-            .iter()
-            .map(|p| match next.next_if(|(q, _)| *q == p) {
-                Some((_, r)) => Asked { depth: r.value, expected_error: r.expected_error },
-                // A measured pixel that was not asked is sure of its depth.
-                None => Asked { depth: self.sparse.get(p.0, p.1).unwrap_or(f32::NAN), expected_error: 0.0 },
-            })
-            .collect();
-        let (width, height) = (self.sparse.width(), self.sparse.height());
-        refine_pixels(width, height, stride, &answers, budget, |x, y| self.wanted((x, y)))
+        pixels: &[(usize, usize)],
+        planned: usize,
+        into: &mut Answers,
+    ) -> Result<()> {
+        let readings = self.ask(pixels, true, into.asked, planned)?;
+        into.asked += pixels.len();
+        into.readings.extend(pixels.iter().copied().zip(readings));
+        Ok(())
     }
 
-    /// The answers, read together with those around them. Measurements have a say also where they are not kept.
-    fn filtered(&self, rgb: &RgbImage, asked: Vec<Answered>) -> Result<Vec<Answered>> {
+    /// Asks at measured pixels, for the alignment. They are not told their measurement: the answer would only repeat it.
+    pub(super) fn ask_anchors(
+        &self,
+        measured: Vec<(usize, usize, f32)>,
+        planned: usize,
+        into: &mut Answers,
+    ) -> Result<()> {
+        let pixels: Vec<(usize, usize)> = measured.iter().map(|m| (m.0, m.1)).collect();
+        let said = self.ask(&pixels, false, into.asked, planned)?;
+        into.asked += said.len();
+        for (anchor, reading) in measured.into_iter().zip(&said) {
+            into.anchors.push(anchor, reading);
+        }
+        Ok(())
+    }
+
+    /// Readable answers, aligned to the measurements.
+    pub(super) fn aligned(&self, answers: &Answers) -> Result<Vec<Answered>> {
+        let (width, height) = self.size();
+        let alignment = Alignment::new(answers.anchors.clone(), width, height)?;
+        let readable = answers.readings.iter().filter(|(_, a)| a.value.is_finite() && a.value > 0.0);
+        let aligned = readable.map(|&((x, y), answer)| {
+            let aligned = match &alignment {
+                Some(alignment) if !self.told((x, y)) => alignment.apply((x, y), answer),
+                _ => answer,
+            };
+            Answered {
+                x,
+                y,
+                depth: aligned.value,
+                confidence: aligned.confidence,
+                expected_error: aligned.expected_error,
+            }
+        });
+        Ok(aligned.collect())
+    }
+
+    /// Aligned answers, read together with those around them. Measurements have a say also where they are not kept; an answer that
+    /// was told its measurement stays as it is.
+    fn filtered(&self, asked: Vec<Answered>, spacing: usize) -> Result<Vec<Answered>> {
         let Some(filter) = &self.options.filter else {
             return Ok(asked);
         };
-        let (width, height) = (self.sparse.width(), self.sparse.height());
+        let (width, height) = self.size();
         let interpolated = match self.hint.is_empty() {
             true => &interpolate::linear(self.sparse)?,
             false => &self.hint,
         };
-        let input = FillInput { width, height, rgb, asked: &asked, sparse: self.sparse };
-        filter.apply(&input, interpolated, self.stride())
+        let input = FillInput { width, height, rgb: self.rgb, asked: &asked, sparse: self.sparse };
+        filter.apply(&input, interpolated, spacing)
     }
 
-    /// Aligns the answers, reads them together, fills the rest, keeps the measurements; and says what is expected at the flagged ones, which are kept
-    /// where the caller insists.
-    pub(super) fn dense(
-        &self,
-        rgb: &RgbImage,
-        answers: Answers,
-        flagged: &[(usize, usize, f32)],
-    ) -> Result<(DepthMap, Vec<Outlier>)> {
-        let (width, height) = (self.sparse.width(), self.sparse.height());
-        let alignment = Alignment::new(answers.anchors, width, height)?;
-        let asked: Vec<Answered> = (answers.readings)
-            .into_iter()
-            .filter(|(_, answer)| answer.value.is_finite() && answer.value > 0.0)
-            .map(|((x, y), answer)| {
-                let aligned = match &alignment {
-                    Some(alignment) if !self.told((x, y)) => alignment.apply((x, y), answer),
-                    _ => answer,
-                };
-                Answered {
-                    x,
-                    y,
-                    depth: aligned.value,
-                    confidence: aligned.confidence,
-                    expected_error: aligned.expected_error,
-                }
-            })
-            .collect();
+    /// The dense map of what was answered so far: answers are aligned, read together and filled in between, measurements are kept.
+    /// And what is expected at the flagged ones, which are kept where the caller insists.
+    pub(super) fn dense(&self, answers: &Answers) -> Result<(DepthMap, Vec<Outlier>)> {
+        let (width, height) = self.size();
+        let asked = self.filtered(self.aligned(answers)?, answers.spacing)?;
         let none = SparseDepth::from_points(width, height, &[])?;
         let kept = if self.options.preserve == Preserve::Keep { self.sparse } else { &none };
-        let asked = self.filtered(rgb, asked)?;
-        let input = FillInput { width, height, rgb, asked: &asked, sparse: kept };
+        let input = FillInput { width, height, rgb: self.rgb, asked: &asked, sparse: kept };
         let mut filled = self.options.fill.fill(&input)?;
         let expected = |&(x, y, measured): &(usize, usize, f32)| Outlier {
             x,
@@ -209,8 +180,8 @@ impl<'a> Questions<'a> {
             measured,
             expected: filled.depth[y * width + x],
         };
-        let outliers = flagged.iter().map(expected).collect();
-        let insisted = if self.options.outliers == Outliers::Preserve { flagged } else { &[] };
+        let outliers = self.flagged.iter().map(expected).collect();
+        let insisted = if self.options.outliers == Outliers::Preserve { self.flagged } else { &[] };
         let mut measured = vec![false; width * height];
         if self.options.preserve == Preserve::Keep {
             for (x, y, depth) in self.sparse.points().chain(insisted.iter().copied()) {
@@ -221,8 +192,32 @@ impl<'a> Questions<'a> {
                 filled.expected_error[i] = 0.0;
             }
         }
+        let (region, far) = (self.region(), self.options.far_limit.unwrap_or(f32::INFINITY));
+        for (i, depth) in filled.depth.iter_mut().enumerate().filter(|(i, _)| !measured[*i]) {
+            if *depth > far || !region.contains(i % width, i / width) {
+                (*depth, filled.confidence[i], filled.expected_error[i]) = (f32::NAN, 0.0, f32::NAN);
+            }
+        }
         let map =
             DepthMap::new(width, height, filled.depth, filled.confidence, filled.expected_error, measured)?;
         Ok((map, outliers))
     }
+}
+
+/// What is known of a frame before any question: its measurements, interpolated linearly, with confidence 0 where nothing was
+/// measured. The expected error is the difference to the nearest measurement.
+pub(super) fn interpolated(sparse: &SparseDepth, options: &CompleteOptions) -> Result<DepthMap> {
+    let (width, height) = (sparse.width(), sparse.height());
+    let (mut depth, nearest) = (interpolate::linear(sparse)?, interpolate::nearest(sparse)?);
+    let mut error: Vec<f32> = depth.iter().zip(&nearest).map(|(a, b)| (a - b).abs()).collect();
+    let measured: Vec<bool> = sparse.as_slice().iter().map(|d| !d.is_nan()).collect();
+    let confidence = measured.iter().map(|&m| if m { 1.0 } else { 0.0 }).collect();
+    let far = options.far_limit.unwrap_or(f32::INFINITY);
+    for i in (0..depth.len()).filter(|&i| !measured[i]) {
+        let inside = options.region.is_none_or(|region| region.contains(i % width, i / width));
+        if depth[i] > far || !inside {
+            (depth[i], error[i]) = (f32::NAN, f32::NAN);
+        }
+    }
+    DepthMap::new(width, height, depth, confidence, error, measured)
 }

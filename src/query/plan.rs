@@ -2,6 +2,7 @@
 
 use crate::error::{Error, Result};
 use std::str::FromStr;
+use std::time::Duration;
 
 /// Which pixels of a frame are asked; the others are filled from them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -13,6 +14,9 @@ pub enum QueryPlan {
     /// At most this many pixels (those of the alignment come on top): half of them on a lattice, then where neighbours
     /// disagree or the answer is unsure.
     Budget(usize),
+    /// As many pixels as can be asked until so much time has passed since [`complete`](crate::DepthCompleter::complete) was called: first a coarse
+    /// lattice, then finer ones, then where neighbours disagree or the answer is unsure.
+    Deadline(Duration),
 }
 
 impl Default for QueryPlan {
@@ -30,9 +34,12 @@ impl FromStr for QueryPlan {
             None if text == "every" => Some(Self::Every),
             Some(("stride", n)) => number(n).map(Self::Stride),
             Some(("budget", n)) => number(n).map(Self::Budget),
+            Some(("deadline", ms)) => number(ms).map(|ms| Self::Deadline(Duration::from_millis(ms as u64))),
             _ => None,
         };
-        plan.ok_or_else(|| Error::argument("plan", text, "every, stride:N or budget:N with N >= 1"))
+        let expected =
+            "every, stride:N, budget:N or deadline:MS (milliseconds) with a whole number from 1 on";
+        plan.ok_or_else(|| Error::argument("plan", text, expected))
     }
 }
 
@@ -42,6 +49,7 @@ impl std::fmt::Display for QueryPlan {
             Self::Every => write!(f, "every"),
             Self::Stride(n) => write!(f, "stride:{n}"),
             Self::Budget(n) => write!(f, "budget:{n}"),
+            Self::Deadline(time) => write!(f, "deadline:{}", time.as_millis()),
         }
     }
 }
@@ -57,6 +65,19 @@ pub fn lattice(width: usize, height: usize, stride: usize) -> Vec<(usize, usize)
         }
     }
     out
+}
+
+/// The pixels of [`lattice`], coarse lattices before the fine ones that hold them, so that those asked up to any moment are spread
+/// over the whole frame.
+pub fn coarse_to_fine(width: usize, height: usize, stride: usize) -> Vec<(usize, usize)> {
+    let mut pixels = lattice(width, height, stride);
+    let Some(&(left, top)) = pixels.first() else {
+        return pixels;
+    };
+    let stride = stride.max(1);
+    let fineness = |&(x, y): &(usize, usize)| (((x - left) | (y - top)) / stride).trailing_zeros();
+    pixels.sort_by_key(|pixel| std::cmp::Reverse(fineness(pixel)));
+    pixels
 }
 
 /// The smallest stride whose lattice has at most `budget` pixels.
@@ -157,7 +178,10 @@ mod tests {
         assert_eq!("every".parse::<QueryPlan>().unwrap(), QueryPlan::Every);
         assert_eq!("stride:3".parse::<QueryPlan>().unwrap(), QueryPlan::Stride(3));
         assert_eq!("budget:500".parse::<QueryPlan>().unwrap(), QueryPlan::Budget(500));
-        for bad in ["", "stride", "stride:0", "stride:x", "budget:-1", "all"] {
+        let late = QueryPlan::Deadline(Duration::from_millis(200));
+        assert_eq!("deadline:200".parse::<QueryPlan>().unwrap(), late);
+        assert_eq!(late.to_string(), "deadline:200");
+        for bad in ["", "stride", "stride:0", "stride:x", "budget:-1", "deadline:0", "deadline:0.2", "all"] {
             assert!(matches!(bad.parse::<QueryPlan>(), Err(Error::Argument { .. })), "{bad}");
         }
     }
@@ -173,6 +197,30 @@ mod tests {
             }
         }
         assert_eq!(lattice(4, 2, 1).len(), 8);
+    }
+
+    #[test]
+    fn the_first_pixels_of_a_lattice_are_spread_over_the_frame() {
+        for (w, h, s) in [(640, 480, 4), (37, 22, 3), (5, 1, 1), (1, 1, 9)] {
+            let mut ordered = coarse_to_fine(w, h, s);
+            for part in [64, 16, 4] {
+                // A quarter of a lattice with twice the stride in each direction, and so on.
+                let first: std::collections::BTreeSet<_> =
+                    ordered.iter().take(ordered.len() / part).collect();
+                let (cols, rows) = (w.div_ceil(s), h.div_ceil(s));
+                if first.len() >= 16 && cols >= 16 && rows >= 16 {
+                    for corner in [(0, 0), (w / 2, 0), (0, h / 2), (w / 2, h / 2)] {
+                        let inside = |p: &&&(usize, usize)| {
+                            (corner.0..corner.0 + w / 2).contains(&p.0)
+                                && (corner.1..corner.1 + h / 2).contains(&p.1)
+                        };
+                        assert!(first.iter().filter(inside).count() * 6 > first.len(), "{w}x{h} {corner:?}");
+                    }
+                }
+            }
+            ordered.sort_by_key(|p| (p.1, p.0));
+            assert_eq!(ordered, lattice(w, h, s), "each pixel once");
+        }
     }
 
     #[test]

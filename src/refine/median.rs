@@ -76,18 +76,13 @@ impl Cells {
         let mut cells = vec![Cell::default(); columns * rows];
         let at = |x: usize, y: usize| y / spacing * columns + x / spacing;
         for a in input.asked.iter().filter(|a| is_valid(a.depth)) {
-            let cell = &mut cells[at(a.x, a.y)];
-            if let Some(free) = cell.answers.get_mut(usize::from(cell.counts[0])) {
-                *free = Vote::from(a);
-                cell.counts[0] += 1;
-            }
+            let Cell { answers, counts, .. } = &mut cells[at(a.x, a.y)];
+            keep(answers, &mut counts[0], Vote::from(a), spacing);
         }
         for (x, y, depth) in input.sparse.points() {
-            let cell = &mut cells[at(x, y)];
-            if let Some(free) = cell.measured.get_mut(usize::from(cell.counts[1])) {
-                *free = Vote { x: x as u32, y: y as u32, depth, confidence: 1.0, error: 0.0 };
-                cell.counts[1] += 1;
-            }
+            let Cell { measured, counts, .. } = &mut cells[at(x, y)];
+            let vote = Vote { x: x as u32, y: y as u32, depth, confidence: 1.0, error: 0.0 };
+            keep(measured, &mut counts[1], vote, spacing);
         }
         Self { cells, columns, spacing }
     }
@@ -103,6 +98,23 @@ impl Cells {
         let rows = span(y, self.cells.len() / self.columns);
         rows.flat_map(move |row| self.cells[row * self.columns..][columns.clone()].iter())
             .flat_map(Cell::votes)
+    }
+}
+
+/// Keeps those votes of a cell that lie nearest to its middle, whatever order they come in.
+fn keep(kept: &mut [Vote; PER_CELL], count: &mut u8, vote: Vote, spacing: usize) {
+    let rank = |v: &Vote| {
+        let apart = |at: u32| (2 * (at as usize % spacing)).abs_diff(spacing - 1);
+        (apart(v.x).max(apart(v.y)), v.y, v.x)
+    };
+    let held = usize::from(*count);
+    if let Some(free) = kept.get_mut(held) {
+        *free = vote;
+        *count += 1;
+    } else if let Some(worst) =
+        kept.iter_mut().max_by_key(|v| rank(v)).filter(|worst| rank(worst) > rank(&vote))
+    {
+        *worst = vote;
     }
 }
 

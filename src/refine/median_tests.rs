@@ -101,6 +101,18 @@ fn the_interpolation_has_the_say_that_it_is_given() {
 }
 
 #[test]
+fn the_order_of_answers_says_nothing() {
+    let mut asked = lattice(1, |x, y| 2.0 + ((x * 7 + y * 13) % 11) as f32 * 0.1);
+    let forwards = filtered(&asked, 1);
+    asked.reverse();
+    let mut backwards = filtered(&asked, 1);
+    backwards.reverse();
+    for (a, b) in forwards.iter().zip(&backwards) {
+        assert_eq!(a.depth, b.depth, "({}, {})", a.x, a.y);
+    }
+}
+
+#[test]
 fn neighbours_that_disagree_cost_confidence() {
     let calm = filtered(&lattice(4, |_, _| 2.0), 4);
     let torn = filtered(&lattice(4, |x, y| if (x + y) / 4 % 2 == 0 { 2.0 } else { 3.0 }), 4);
