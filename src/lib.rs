@@ -57,7 +57,8 @@
 //! | module | what |
 //! |---|---|
 //! | this one | [`DepthCompleter`]: one frame, start to end; its options, progress, cancelling; [`LoadOptions`], [`Adapter`] |
-//! | [`depth`] | sparse and dense maps, cameras, sampling patterns, files, interpolation |
+//! | [`depth`] | sparse and dense maps, cameras, clouds and depth cameras into the picture, sampling patterns, files, interpolation |
+//! | [`messages`] | structs shaped like ROS's `Image`, `CameraInfo`, `PointCloud2`, in and out |
 //! | [`classical`], [`metrics`], [`draw`] | completion without a model; errors and intervals; colours and figures |
 //! | [`refine`] | the trait `Fill`: how pixels that were not asked are filled |
 //! | [`settings`] | how a checkpoint is asked: `sdim.json` |
@@ -102,6 +103,7 @@ pub mod hub;
 mod image;
 #[allow(unsafe_code)]
 mod kernels;
+pub mod messages;
 pub mod metrics;
 mod model;
 mod query;
@@ -113,14 +115,14 @@ mod supervise;
 pub mod system;
 mod vlm;
 
-pub use self::image::read_rgb;
+pub use self::image::{PixelEncoding, decode_rgb, read_rgb};
 pub use ::image::RgbImage;
 pub use candle_core::{Device, Tensor};
 pub use complete::{
     CancelToken, CompleteOptions, Completion, DepthCompleter, Outliers, Partial, Preserve, PreviewCallback,
     Progress, ProgressCallback, Region, StageSeconds,
 };
-pub use depth::{DepthMap, DepthScale, Intrinsics, SparseDepth};
+pub use depth::{Camera, DepthMap, DepthScale, Distortion, Intrinsics, SparseDepth, Transform};
 pub use error::{Error, Result};
 pub use kernels::WeightFormat;
 pub use model::Adapter;

@@ -99,6 +99,26 @@ fn complete_writes_nothing_on_bad_input() {
 }
 
 #[test]
+fn robot_answers_messages_with_messages() {
+    let of = |confidence: &str| {
+        let out = run("robot", &["--json", "--plan", "stride:16", "--min-confidence", confidence]);
+        assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
+        serde_json::from_slice::<Value>(&out.stdout).unwrap()
+    };
+    let all = of("0");
+    assert_eq!((&all["points_in"], &all["measured"], &all["hidden"]), (&500.into(), &500.into(), &0.into()));
+    assert_eq!((&all["points_out"], &all["point_step"]), (&(640 * 480).into(), &20.into()));
+    // The same map as that of `complete`, whose measurements come from a file.
+    let dir = tempfile::tempdir().unwrap();
+    let out = run("complete", &["--json", "--plan", "stride:16", "--out", text(dir.path())]);
+    let complete: Value = serde_json::from_slice(&out.stdout).unwrap();
+    let [ours, file] = [&all, &complete].map(|v| v["mae"].as_f64().unwrap());
+    assert!((ours - file).abs() < 1e-4 * file, "{ours} and {file} m");
+    let sure = of("0.5")["points_out"].as_u64().unwrap();
+    assert!((501..640 * 480).contains(&sure), "{sure}");
+}
+
+#[test]
 fn train_resumes_and_its_checkpoint_loads() {
     let dir = tempfile::tempdir().unwrap();
     let model = dir.path().join("model");

@@ -4,6 +4,8 @@
 //! values; x grows to the right, y grows downwards; a missing value is NaN in memory and 0 in integer files.
 
 mod camera;
+mod cloud;
+mod hidden;
 pub mod interpolate;
 pub mod io;
 mod map;
@@ -13,7 +15,9 @@ pub(crate) mod sampling;
 mod scale;
 mod sparse;
 
-pub use camera::Intrinsics;
+pub use camera::{Camera, Distortion, Intrinsics, Transform};
+pub use cloud::ProjectionReport;
+pub use hidden::Visibility;
 pub use map::{DepthMap, Saturation};
 pub use sampling::{SparsePattern, sample_points};
 pub use scale::DepthScale;

@@ -32,6 +32,29 @@ pub(crate) fn check_length(what: &'static str, found: usize, expected: usize) ->
     if found == expected { Ok(()) } else { Err(Error::BufferLength { what, expected, found }) }
 }
 
+/// The rows of a borrowed buffer: `row` elements each, that begin every `stride` elements. The last one need not be followed by anything.
+///
+/// # Errors
+/// [`Error::Argument`] for a stride below `row`, [`Error::BufferLength`] for a buffer that ends before the last row does.
+pub(crate) fn rows<'a, T>(
+    what: &'static str,
+    values: &'a [T],
+    row: usize,
+    height: usize,
+    stride: usize,
+) -> Result<impl Iterator<Item = &'a [T]>> {
+    if stride < row || stride == 0 {
+        let expected = format!("at least the {row} elements of a row of the {what}");
+        return Err(Error::argument("stride", stride, expected));
+    }
+    let before = height.saturating_sub(1).checked_mul(stride);
+    let expected = before.and_then(|before| before.checked_add(row)).unwrap_or(usize::MAX);
+    if values.len() < expected {
+        return Err(Error::BufferLength { what, expected, found: values.len() });
+    }
+    Ok(values.chunks(stride).take(height).map(move |line| line.get(..row).unwrap_or(line)))
+}
+
 /// Whether a number is a usable depth: finite and above zero.
 pub(crate) fn is_valid(depth: f32) -> bool {
     depth.is_finite() && depth > 0.0

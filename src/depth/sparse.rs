@@ -6,7 +6,7 @@ use ndarray::ArrayView2;
 
 use super::DepthScale;
 use super::io::{npy, png16};
-use super::pixels::{check_length, is_valid, median, pixel_count};
+use super::pixels::{check_length, is_valid, median, pixel_count, rows};
 use crate::error::{Error, Result};
 
 /// Measured depth at some pixels of a frame, in metres (Z-depth), NaN where nothing was measured.
@@ -17,10 +17,9 @@ use crate::error::{Error, Result};
 /// let points = SparseDepth::from_points(640, 480, &[(12, 30, 1.5), (600, 470, 2.25)])?;
 /// let map = SparseDepth::new(4, 1, vec![0.0, 1.5, f32::NAN, 2.0])?;
 /// assert_eq!((points.measured(), map.measured()), (2, 2));
-/// // A sensor's integers have a unit that must be named: here 1 is a millimetre.
-/// let raw: [u16; 4] = [0, 1500, 0, 2000];
-/// let scale = DepthScale::millimetres();
-/// let same = SparseDepth::new(4, 1, raw.iter().map(|&v| scale.metres(v)).collect())?;
+/// // A sensor's integers have a unit that must be named: here 1 is a millimetre. Each row has 4 pixels, and 5 elements.
+/// let raw: [u16; 5] = [0, 1500, 0, 2000, 65535];
+/// let same = SparseDepth::from_u16(&raw, 4, 1, 5, DepthScale::millimetres())?;
 /// assert_eq!(same.get(3, 0), map.get(3, 0));
 /// # Ok::<(), sdim::Error>(())
 /// ```
@@ -74,6 +73,45 @@ impl SparseDepth {
                 *pixel = pixel.min(value);
             }
         }
+        Self::new(width, height, depth)
+    }
+
+    /// From a sensor's integers, borrowed: rows of `width` values that begin every `stride` elements, with the unit that `scale` names. 0 means
+    /// "not measured".
+    ///
+    /// # Errors
+    /// [`Error::Argument`] for a stride below the width, [`Error::BufferLength`] for a buffer that ends before the last row does, otherwise as
+    /// [`SparseDepth::new`].
+    pub fn from_u16(
+        values: &[u16],
+        width: usize,
+        height: usize,
+        stride: usize,
+        scale: DepthScale,
+    ) -> Result<Self> {
+        Self::from_rows(values, width, height, stride, |v| scale.metres(v))
+    }
+
+    /// From metres in a borrowed buffer: rows of `width` values that begin every `stride` elements. 0, NaN, infinite and negative values mean
+    /// "not measured". Where rows follow each other without gaps, [`SparseDepth::new`] takes a vector as it is and copies nothing.
+    ///
+    /// # Errors
+    /// As [`SparseDepth::from_u16`].
+    pub fn from_f32(values: &[f32], width: usize, height: usize, stride: usize) -> Result<Self> {
+        Self::from_rows(values, width, height, stride, |v| v)
+    }
+
+    fn from_rows<T: Copy>(
+        values: &[T],
+        width: usize,
+        height: usize,
+        stride: usize,
+        metres: impl Fn(T) -> f32,
+    ) -> Result<Self> {
+        let pixels = pixel_count(width, height)?;
+        let rows = rows("depth", values, width, height, stride)?;
+        let mut depth = Vec::with_capacity(pixels);
+        rows.for_each(|row| depth.extend(row.iter().map(|&v| metres(v))));
         Self::new(width, height, depth)
     }
 
@@ -237,6 +275,27 @@ mod tests {
         for outside in [(3, 0, 1.0), (0, 2, 1.0)] {
             assert!(matches!(SparseDepth::from_points(3, 2, &[outside]), Err(Error::Argument { .. })));
         }
+    }
+
+    #[test]
+    fn rows_may_have_gaps() {
+        let raw = [1000, 0, 9, 2000, 500, 9, 1, 65535];
+        let scale = DepthScale::millimetres();
+        let sparse = SparseDepth::from_u16(&raw, 2, 3, 3, scale).unwrap();
+        let expected = [(0, 0, 1.0), (0, 1, 2.0), (1, 1, 0.5), (0, 2, 0.001), (1, 2, 65.535)];
+        assert_eq!(sparse.points().collect::<Vec<_>>(), expected);
+        let metres = [1.0, f32::NAN, 7.0, -2.0, 0.5];
+        let sparse = SparseDepth::from_f32(&metres, 2, 2, 3).unwrap();
+        assert_eq!(sparse.points().collect::<Vec<_>>(), [(0, 0, 1.0), (1, 1, 0.5)]);
+
+        let short = SparseDepth::from_u16(&raw[..7], 2, 3, 3, scale);
+        assert!(matches!(short, Err(Error::BufferLength { expected: 8, found: 7, .. })));
+        let narrow = SparseDepth::from_f32(&metres, 3, 1, 2);
+        assert!(matches!(narrow, Err(Error::Argument { name: "stride", .. })));
+        let huge = SparseDepth::from_f32(&metres, 2, 3, usize::MAX);
+        assert!(matches!(huge, Err(Error::BufferLength { .. })));
+        assert!(matches!(SparseDepth::from_f32(&metres, 0, 3, 3), Err(Error::ImageSize { .. })));
+        assert!(matches!(SparseDepth::from_f32(&[2e4], 1, 1, 1), Err(Error::DepthRange { .. })));
     }
 
     #[test]

@@ -1,6 +1,10 @@
-//! RGB frames: from files, and in other sizes.
+//! RGB frames: from files, from cameras' raw frames, and in other sizes.
 
+mod bayer;
+mod encodings;
 pub mod resize;
+
+pub use encodings::{PixelEncoding, decode_rgb};
 
 use crate::error::{Error, Result};
 use image::{ColorType, DynamicImage, ImageDecoder, ImageError, ImageReader, RgbImage};
