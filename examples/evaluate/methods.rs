@@ -18,7 +18,7 @@ pub struct Method {
 
 enum Kind {
     Baseline(Baseline),
-    Checkpoint(Box<DepthCompleter>, CompleteOptions),
+    Checkpoint(Box<(DepthCompleter, CompleteOptions)>),
 }
 
 /// A method's result for a frame.
@@ -42,7 +42,8 @@ impl Method {
     pub fn complete(&self, rgb: &RgbImage, sparse: &SparseDepth) -> sdim::Result<Answer> {
         Ok(match &self.kind {
             Kind::Baseline(baseline) => Answer::Depth(baseline.complete(rgb, sparse)?),
-            Kind::Checkpoint(completer, options) => {
+            Kind::Checkpoint(checkpoint) => {
+                let (completer, options) = &**checkpoint;
                 Answer::Map(Box::new(completer.complete(rgb, sparse, options)?))
             }
         })
@@ -84,7 +85,7 @@ pub fn load_all(args: &Args) -> anyhow::Result<Vec<Method>> {
         methods.push(Method {
             name: name.clone(),
             fingerprint: settings::fingerprint(checkpoint, args.adapter.as_deref())?,
-            kind: Kind::Checkpoint(Box::new(completer), asking),
+            kind: Kind::Checkpoint(Box::new((completer, asking))),
         });
     }
     for baseline in Baseline::ALL.into_iter().filter(|b| wanted(b.name())) {

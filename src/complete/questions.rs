@@ -10,6 +10,9 @@ use crate::query::{Hint, Query, Reading};
 use crate::refine::{Answered, FillInput};
 use image::RgbImage;
 
+/// Answers that lie at most so many pixels apart speak for the measurements between them, too.
+const CLOSE: usize = 4;
+
 /// What was answered in a frame.
 #[derive(Default)]
 pub(super) struct Answers {
@@ -172,7 +175,11 @@ impl<'a> Questions<'a> {
         let asked = self.filtered(self.aligned(answers)?, answers.spacing)?;
         let none = SparseDepth::from_points(width, height, &[])?;
         let kept = if self.options.preserve == Preserve::Keep { self.sparse } else { &none };
-        let input = FillInput { width, height, rgb: self.rgb, asked: &asked, sparse: kept };
+        // What was measured between answers that lie this close has been heard by the filter; as corners of the fill such pixels would be
+        // spikes at edges, where the depth sensor and the picture differ by some pixels.
+        let heard = self.options.filter.is_some() && answers.spacing <= CLOSE && !asked.is_empty();
+        let corners = if heard { &none } else { kept };
+        let input = FillInput { width, height, rgb: self.rgb, asked: &asked, sparse: corners };
         let mut filled = self.options.fill.fill(&input)?;
         let expected = |&(x, y, measured): &(usize, usize, f32)| Outlier {
             x,

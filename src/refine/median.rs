@@ -25,7 +25,7 @@ pub struct MedianFilter {
 
 impl Default for MedianFilter {
     fn default() -> Self {
-        Self { sigma: 1.5, doubt: 0.03, interpolated: 0.1 }
+        Self { sigma: 1.5, doubt: 0.03, interpolated: 0.15 }
     }
 }
 

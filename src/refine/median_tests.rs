@@ -6,7 +6,8 @@ const SIZE: (usize, usize) = (64, 48);
 
 fn lattice(stride: usize, depth: impl Fn(usize, usize) -> f32) -> Vec<Answered> {
     let place = |i: usize| (i % (SIZE.0 / stride) * stride, i / (SIZE.0 / stride) * stride);
-    let one = |(x, y)| Answered { x, y, depth: depth(x, y), confidence: 0.9, expected_error: 0.05 };
+    let one =
+        |(x, y)| Answered { x, y, depth: depth(x, y), confidence: 0.9, expected_error: 0.025 * depth(x, y) };
     (0..(SIZE.0 / stride) * (SIZE.1 / stride)).map(place).map(one).collect()
 }
 
