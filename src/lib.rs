@@ -56,7 +56,7 @@
 //!
 //! | module | what |
 //! |---|---|
-//! | this one | [`DepthCompleter`]: one frame, start to end; its options, progress, cancelling; [`LoadOptions`], [`Adapter`] |
+//! | this one | [`DepthCompleter`]: one frame, start to end; [`Stream`]: frames that follow each other; options, progress, cancelling; [`LoadOptions`], [`Adapter`] |
 //! | [`depth`] | sparse and dense maps, cameras, clouds and depth cameras into the picture, sampling patterns, files, interpolation |
 //! | [`messages`] | structs shaped like ROS's `Image`, `CameraInfo`, `PointCloud2`, in and out |
 //! | [`cloud`], [`calibration`] | point clouds from files, from maps, to files; calibrations of ROS and KITTI |
@@ -115,6 +115,7 @@ mod query;
 pub mod refine;
 #[cfg(any(feature = "train", feature = "benchmarks", feature = "meshes"))]
 mod scenes;
+mod stream;
 #[cfg(feature = "train")]
 mod supervise;
 pub mod system;
@@ -132,6 +133,7 @@ pub use error::{Error, Result};
 pub use kernels::WeightFormat;
 pub use model::Adapter;
 pub use query::{QueryPlan, Readout};
+pub use stream::{Latest, LatestFrames, Stream, StreamOptions};
 pub use vlm::checkpoint::LoadOptions;
 
 /// What `sdim.json` says: how a checkpoint is asked, and what an adapter adds to it.

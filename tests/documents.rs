@@ -145,6 +145,12 @@ fn examples() -> BTreeMap<String, BTreeSet<String>> {
         } else if path.extension().is_some_and(|e| e == "rs") {
             files.push(path.clone());
         }
+        // Files of its own that lie elsewhere.
+        for file in files.clone() {
+            let source = std::fs::read_to_string(&file).unwrap();
+            let beside = file.parent().unwrap();
+            files.extend(between(&source, "#[path = \"", '"').map(|other| beside.join(other)));
+        }
         if !files.is_empty() {
             let sources = files.iter().map(|file| std::fs::read_to_string(file).unwrap());
             let name = path.file_stem().unwrap().to_string_lossy().into_owned();

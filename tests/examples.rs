@@ -122,6 +122,20 @@ fn robot_answers_messages_with_messages() {
 }
 
 #[test]
+fn stream_compares_both_ways() {
+    let flags = ["--json", "--frames", "4", "--width", "96", "--height", "72", "--points", "40"];
+    for poses in [&[][..], &["--no-poses", "--speed", "0"]] {
+        let out = run("stream", &[&flags[..], poses].concat());
+        assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
+        let v: Value = serde_json::from_slice(&out.stdout).unwrap();
+        for key in ["frames_per_second", "asked", "mae", "flicker"] {
+            assert!(v["single"][key].as_f64() > Some(0.0) && v["stream"][key].as_f64() > Some(0.0), "{key}");
+        }
+        assert!(v["stream"]["asked"].as_f64() < v["single"]["asked"].as_f64());
+    }
+}
+
+#[test]
 fn train_resumes_and_its_checkpoint_loads() {
     let dir = tempfile::tempdir().unwrap();
     let model = dir.path().join("model");

@@ -2,8 +2,11 @@
 
 mod alignment;
 mod belief;
+mod cells;
+mod follow;
 mod options;
 mod pace;
+mod prior;
 mod questions;
 mod schedule;
 mod stages;
@@ -12,6 +15,7 @@ pub use options::{
     CancelToken, CompleteOptions, Outliers, Partial, Preserve, PreviewCallback, Progress, ProgressCallback,
     Region,
 };
+pub(crate) use prior::Prior;
 pub use stages::StageSeconds;
 
 use crate::depth::outliers::Outlier;
@@ -134,6 +138,17 @@ impl DepthCompleter {
         sparse: &SparseDepth,
         options: &CompleteOptions,
     ) -> Result<Completion> {
+        self.complete_after(rgb, sparse, options, None)
+    }
+
+    /// As [`DepthCompleter::complete_detailed`], in a frame of which a map is expected.
+    pub(crate) fn complete_after(
+        &self,
+        rgb: &RgbImage,
+        sparse: &SparseDepth,
+        options: &CompleteOptions,
+        prior: Option<&Prior>,
+    ) -> Result<Completion> {
         let start = Instant::now();
         self.check(rgb, sparse, options)?;
         let pixels = sparse.width() * sparse.height();
@@ -154,13 +169,16 @@ impl DepthCompleter {
         let span = tracing::info_span!("queries").entered();
         let mark = Instant::now();
         let questions = Questions::new(&self.model, rgb, &believed, options)?;
-        let answers = questions.ask_all(clock, pace)?;
+        let answers = match prior {
+            Some(prior) => questions.ask_following(prior, clock, pace)?,
+            None => questions.ask_all(clock, pace)?,
+        };
         drop(span);
         seconds.queries = mark.elapsed().as_secs_f64();
         let _refine = tracing::info_span!("refine").entered();
         let mark = Instant::now();
         let asked = answers.asked + believed.asked;
-        if answers.asked == 0 && clock.is_some() {
+        if answers.asked == 0 && clock.is_some() && prior.is_none() {
             let late = Completion::interpolated(&believed.sparse, options, start)?;
             self.pace.learn(pixels, &seconds, 0);
             return Ok(Completion {

@@ -18,6 +18,10 @@ const CLOSE: usize = 4;
 pub(super) struct Answers {
     /// The plan's pixels.
     pub(super) readings: Vec<((usize, usize), Reading)>,
+    /// Answers that are aligned already.
+    pub(super) settled: Vec<Answered>,
+    /// Depths that were expected, aligned, and stand for answers.
+    pub(super) carried: Vec<Answered>,
     /// Measured pixels that were asked for the alignment.
     pub(super) anchors: Anchors,
     /// Pixels asked, those for the alignment included.
@@ -153,6 +157,14 @@ impl<'a> Questions<'a> {
         Ok(aligned.collect())
     }
 
+    /// All that is known of the frame, aligned.
+    fn known(&self, answers: &Answers) -> Result<Vec<Answered>> {
+        let mut known = self.aligned(answers)?;
+        known.extend(&answers.settled);
+        known.extend(&answers.carried);
+        Ok(known)
+    }
+
     /// Aligned answers, read together with those around them. Measurements have a say also where they are not kept; an answer that
     /// was told its measurement stays as it is.
     fn filtered(&self, asked: Vec<Answered>, spacing: usize) -> Result<Vec<Answered>> {
@@ -173,7 +185,11 @@ impl<'a> Questions<'a> {
     /// And what is expected at the flagged ones, which are kept where the caller insists.
     pub(super) fn dense(&self, answers: &Answers) -> Result<(DepthMap, Vec<Outlier>)> {
         let (width, height) = self.size();
-        let asked = self.filtered(self.aligned(answers)?, answers.spacing)?;
+        let mut asked = self.filtered(self.known(answers)?, answers.spacing)?;
+        // What was expected has been through the filter already, when it was answered.
+        let fresh = asked.len() - answers.carried.len();
+        asked.truncate(fresh);
+        asked.extend(&answers.carried);
         let none = SparseDepth::from_points(width, height, &[])?;
         let kept = if self.options.preserve == Preserve::Keep { self.sparse } else { &none };
         // What was measured between answers that lie this close has been heard by the filter; as corners of the fill such pixels would be

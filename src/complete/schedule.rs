@@ -178,7 +178,7 @@ impl Questions<'_> {
     }
 
     /// Asks pixels until the time is over; whether all were asked. `seconds` for one answer follow what is seen.
-    fn ask_while(
+    pub(super) fn ask_while(
         &self,
         clock: &Clock,
         refine: f64,

@@ -13,6 +13,7 @@ mod lidar;
 mod light;
 mod objects;
 mod rooms;
+mod scene;
 pub mod sensor;
 mod shapes;
 mod space;
@@ -29,6 +30,7 @@ use rand_chacha::ChaCha8Rng;
 use crate::depth::Intrinsics;
 use crate::error::{Error, Result};
 pub use lidar::SpinningLidar;
+pub use scene::Scene;
 use stage::Stage;
 
 /// An RGB image with the depth of every pixel.
@@ -62,6 +64,15 @@ const LARGEST_SIDE: usize = 8192;
 /// The same seed and size always give the same frame. It runs on the calling thread only; make many frames in parallel.
 /// Fails with [`Error::Argument`] when a side is 0 or above 8192 pixels.
 pub fn procedural(seed: u64, width: usize, height: usize) -> Result<RgbdFrame> {
+    let (mut stage, hits) = furnished_stage(seed, width, height)?;
+    let rgb = picture(&mut stage, &hits, width, height);
+    let scale = scale(&mut stage);
+    let depth = hits.depth.iter().map(|&t| if t.is_finite() { t * scale } else { f32::NAN }).collect();
+    Ok(RgbdFrame { rgb, depth, intrinsics: stage.camera.k })
+}
+
+/// The scene of [`procedural`] before its picture is taken, and what its camera sees.
+fn furnished_stage(seed: u64, width: usize, height: usize) -> Result<(Stage, cast::Hits)> {
     check_size(width, height)?;
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     // A camera may end up before a blank wall or under the floor; a few scenes are thrown away for that.
@@ -72,11 +83,14 @@ pub fn procedural(seed: u64, width: usize, height: usize) -> Result<RgbdFrame> {
         }
         (stage, hits) = attempt(&mut rng, width, height);
     }
-    let rgb = picture(&mut stage, &hits, width, height);
-    // The whole scene in another size looks the same: sizes must be learnt from the measurements.
-    let scale = if stage.chance(0.5) { stage.log(0.5, 2.0) } else { 1.0 };
-    let depth = hits.depth.iter().map(|&t| if t.is_finite() { t * scale } else { f32::NAN }).collect();
-    Ok(RgbdFrame { rgb, depth, intrinsics: stage.camera.k })
+    Ok((stage, hits))
+}
+
+/// How much larger than built a scene of [`procedural`] is, drawn after its picture.
+///
+/// The whole scene in another size looks the same: sizes must be learnt from the measurements.
+fn scale(stage: &mut Stage) -> f32 {
+    if stage.chance(0.5) { stage.log(0.5, 2.0) } else { 1.0 }
 }
 
 /// A street as a camera on a car sees it, 1.6 to 2 m above the road, with houses, trees, poles, vehicles, people: 2 to 120 m and

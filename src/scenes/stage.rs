@@ -19,7 +19,7 @@ pub(super) struct Light {
 }
 
 /// What the renderer needs.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub(super) struct Stage {
     pub rng: ChaCha8Rng,
     pub solids: Vec<Solid>,
