@@ -2,7 +2,7 @@
 //!
 //! ```sh
 //! number_tokens --model Qwen2.5-VL-3B-Instruct --out my-adapter
-//! complete --model Qwen2.5-VL-3B-Instruct --adapter my-adapter --rgb rgb.png --sparse sparse.png
+//! complete --model Qwen2.5-VL-3B-Instruct --adapter my-adapter --rgb rgb.png --sparse sparse.png --depth-scale mm
 //! ```
 //!
 //! `sdim.json` says how the checkpoint is asked: a pointer with a hint asks, measurements stand in the prefix, and both are number tokens as the

@@ -51,11 +51,13 @@ impl Yaml {
             let value = value.trim();
             let name = path(&open).ok_or_else(wrong)?;
             if value.starts_with('[') {
-                let mut list = value.to_string();
-                while !list.contains(']') {
+                let (mut list, mut closed) = (value.to_string(), value.contains(']'));
+                while !closed {
                     let (_, more) = lines.next().ok_or_else(|| format!("no `]` behind {name:.40}"))?;
                     list.push(' ');
-                    list.push_str(without_comment(more).trim());
+                    let more = without_comment(more).trim();
+                    closed = more.contains(']');
+                    list.push_str(more);
                 }
                 let inner = list.strip_prefix('[').and_then(|l| l.strip_suffix(']')).ok_or_else(wrong)?;
                 let items = inner.split(',').map(|item| unquoted(item.trim())).collect::<Vec<_>>();

@@ -176,7 +176,7 @@ fn fields<'a>(names: &[&'a str], sizes: &[usize], kinds: &[&str], counts: &[usiz
             (kind, size) => return Err(format!("field {} of TYPE {kind:.20} and SIZE {size}", names[i])),
         };
         let count = counts.get(i).copied().unwrap_or(1);
-        if count == 0 && matches!(names[i], "x" | "y" | "z") {
+        if count == 0 && ["x", "y", "z"].iter().any(|name| names[i].eq_ignore_ascii_case(name)) {
             return Err(format!("field {} with COUNT 0", names[i]));
         }
         Ok(Field { name: names[i], kind, count })

@@ -10,6 +10,9 @@ use crate::query::plan::stride_within;
 use crate::query::told::choose_evenly;
 use crate::query::{QueryPlan, Reading};
 use crate::refine::Answered;
+use rand::SeedableRng;
+use rand::seq::SliceRandom;
+use rand_chacha::ChaCha8Rng;
 use std::collections::HashSet;
 
 /// One of so many rows and columns of the lattice is asked as a check.
@@ -58,35 +61,45 @@ impl Questions<'_> {
             true => Alignment::new(anchors, width, height)?,
             false => None,
         };
-        let mut answers = Answers { spacing: stride, ..Default::default() };
+        let mut answers = Answers { spacing: stride, follows: true, ..Default::default() };
         let refine = pace.refine * (width * height) as f64;
         let mut seconds = pace.answer.unwrap_or(UNSEEN_ANSWER);
-        let mut ask = |pixels: &[(usize, usize)], into: &mut Answers| match &clock {
-            Some(clock) => self.ask_while(clock, refine, &mut seconds, pixels, into).map(|_| ()),
-            None => self.ask_plan(pixels, into.asked + pixels.len(), into),
+        // Where the time may end before the pixels do, those that were asked are to be spread over the frame, and others in each frame.
+        let ask = |mut pixels: Vec<(usize, usize)>, into: &mut Answers, seconds: &mut f64| match &clock {
+            Some(clock) => {
+                pixels.shuffle(&mut ChaCha8Rng::seed_from_u64(prior.turn as u64));
+                self.ask_while(clock, refine, seconds, &pixels, into)
+            }
+            None => self.ask_plan(&pixels, into.asked + pixels.len(), into).map(|()| true),
         };
         let due = |(i, cell): &(usize, &Cell)| {
             (cell.ask || cells.checked(*i, CHECK, prior.turn)) && self.wanted(cell.pixel)
         };
         let first: Vec<_> = cells.iter().enumerate().filter(due).map(|(_, cell)| cell.pixel).collect();
         if self.options.align {
-            let count = (first.len() / ANCHOR_SHARE).clamp(ANCHORS.0, ANCHORS.1);
+            let fitting = clock.map(|clock| ((clock.left() - refine) / seconds.max(1e-9)).max(0.0) as usize);
+            let most = fitting.map_or(usize::MAX, |all| all / ANCHOR_SHARE);
+            let count = (first.len() / ANCHOR_SHARE).clamp(ANCHORS.0, ANCHORS.1).min(most);
             let measured = choose_evenly(self.sparse, count, 0);
             let planned = measured.len() + first.len();
             self.ask_anchors(measured, planned, &mut answers)?;
         }
-        ask(&first, &mut answers)?;
+        let asked: HashSet<(usize, usize)> = first.iter().copied().collect();
+        let mut whole = ask(first, &mut answers, &mut seconds)?;
         for answer in self.aligned(&answers)? {
             let cell = cells.at((answer.x, answer.y));
             if !cells.get(cell).ask && contradicts(prior, answer.y * width + answer.x, &answer) {
                 cells.forget(cell, AROUND);
             }
         }
-        let asked: HashSet<(usize, usize)> = first.into_iter().collect();
         let late = |cell: &&Cell| cell.ask && !asked.contains(&cell.pixel) && self.wanted(cell.pixel);
         let second: Vec<_> = cells.iter().filter(late).map(|cell| cell.pixel).collect();
-        ask(&second, &mut answers)?;
+        whole &= ask(second, &mut answers, &mut seconds)?;
         self.settle(prior, &cells, alignment.as_ref(), &mut answers)?;
+        if !whole {
+            let known = answers.settled.len() + answers.readings.len() + answers.carried.len();
+            answers.spacing = self.spacing_of(known).max(stride);
+        }
         Ok(answers)
     }
 

@@ -47,6 +47,8 @@ pub struct Completion {
     pub flagged: Vec<Outlier>,
     /// Time per stage.
     pub seconds: StageSeconds,
+    /// Whether a deadline left no time for any question.
+    pub(crate) interpolated: bool,
 }
 
 /// Smallest side of a frame, pixels: one merged token of the published checkpoints.
@@ -160,7 +162,7 @@ impl DepthCompleter {
         let needed = (pace.prefix.unwrap_or(0.0) + pace.refine) * pixels as f64;
         if clock.is_some_and(|clock| clock.left() < needed) {
             self.pace.skipped();
-            return Completion::interpolated(sparse, options, start);
+            return Completion::interpolated(sparse, &[], options, start);
         }
         let mut seconds = StageSeconds::default();
         let _span =
@@ -178,8 +180,8 @@ impl DepthCompleter {
         let _refine = tracing::info_span!("refine").entered();
         let mark = Instant::now();
         let asked = answers.asked + believed.asked;
-        if answers.asked == 0 && clock.is_some() && prior.is_none() {
-            let late = Completion::interpolated(&believed.sparse, options, start)?;
+        if answers.is_empty() && clock.is_some() {
+            let late = Completion::interpolated(&believed.sparse, &believed.flagged, options, start)?;
             self.pace.learn(pixels, &seconds, 0);
             return Ok(Completion {
                 asked,
@@ -189,9 +191,11 @@ impl DepthCompleter {
         }
         let (map, flagged) = questions.dense(&answers)?;
         seconds.refine = mark.elapsed().as_secs_f64();
-        self.pace.learn(pixels, &seconds, answers.asked);
+        // What a preview took is no answer's time.
+        let timed = if options.preview.is_none() { answers.asked } else { 0 };
+        self.pace.learn(pixels, &seconds, timed);
         seconds.total = start.elapsed().as_secs_f64();
-        Ok(Completion { map, asked, flagged, seconds })
+        Ok(Completion { map, asked, flagged, seconds, interpolated: false })
     }
 
     /// How far some pixels are, without the rest of the frame: `pixels` are (column, row), the answers come in their order, in metres. A
@@ -231,11 +235,14 @@ impl DepthCompleter {
         let answers = questions.ask_pixels(pixels)?;
         let said: HashMap<(usize, usize), Answered> =
             questions.aligned(&answers)?.into_iter().map(|a| ((a.x, a.y), a)).collect();
-        let one = |&(x, y): &(usize, usize)| match believed
-            .sparse
-            .get(x, y)
-            .filter(|_| !questions.wanted((x, y)))
-        {
+        let insisted = options.preserve == Preserve::Keep && options.outliers == Outliers::Preserve;
+        let kept: HashMap<(usize, usize), f32> =
+            (believed.flagged.iter().filter(|_| insisted)).map(|&(x, y, depth)| ((x, y), depth)).collect();
+        let measured = |(x, y): (usize, usize)| {
+            let told = believed.sparse.get(x, y).filter(|_| !questions.wanted((x, y)));
+            told.or_else(|| kept.get(&(x, y)).copied())
+        };
+        let one = |&(x, y): &(usize, usize)| match measured((x, y)) {
             Some(depth) => Answered { x, y, depth, confidence: 1.0, expected_error: 0.0 },
             None => {
                 let unread = Answered { x, y, depth: f32::NAN, confidence: 0.0, expected_error: f32::NAN };
@@ -275,9 +282,14 @@ impl DepthCompleter {
 
 impl Completion {
     /// For want of time: the measurements, interpolated.
-    fn interpolated(sparse: &SparseDepth, options: &CompleteOptions, start: Instant) -> Result<Self> {
-        let map = questions::interpolated(sparse, options)?;
+    fn interpolated(
+        sparse: &SparseDepth,
+        flagged: &[(usize, usize, f32)],
+        options: &CompleteOptions,
+        start: Instant,
+    ) -> Result<Self> {
+        let (map, flagged) = questions::interpolated(sparse, flagged, options)?;
         let seconds = StageSeconds { total: start.elapsed().as_secs_f64(), ..Default::default() };
-        Ok(Self { map, asked: 0, flagged: Vec::new(), seconds })
+        Ok(Self { map, asked: 0, flagged, seconds, interpolated: true })
     }
 }

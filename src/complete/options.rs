@@ -145,7 +145,8 @@ impl<'a> Partial<'a> {
     }
 }
 
-/// Called with what is known of a frame after each few thousand answers.
+/// Called with what is known of a frame after some thousand answers, under a deadline after each twentieth of the time; not in frames of a
+/// stream after the first.
 pub type PreviewCallback = Arc<dyn Fn(&Partial) + Send + Sync>;
 
 /// Called after each batch of answers.

@@ -17,6 +17,9 @@ pub(super) struct Seconds {
 /// What refinement is taken to cost before it was seen, seconds per pixel: 60 ms for 640x480.
 const UNSEEN_REFINE: f64 = 2e-7;
 
+/// So many answers of a frame say what one costs; fewer carry too much of what a frame costs in any case.
+const ENOUGH: usize = 64;
+
 /// What is left of the known time of a prefix after a frame that had no time for it. So one frame in 14 is tried, and late, where a prefix takes
 /// one and a half times what there is, one in 23 where it takes twice that.
 const AFTER_SKIP: f64 = 0.97;
@@ -47,11 +50,13 @@ impl Pace {
         let mix = |old: Option<f64>, new: f64| old.map_or(new, |old| 0.5 * (old + new));
         let pixels = pixels.max(1) as f64;
         known.prefix = Some(mix(known.prefix, (stages.check + stages.encode + stages.prefill) / pixels));
-        if asked > 0 {
+        if asked >= ENOUGH {
             known.answer = Some(mix(known.answer, stages.queries / asked as f64));
         }
-        let seen = (known.refine != UNSEEN_REFINE).then_some(known.refine);
-        known.refine = mix(seen, stages.refine / pixels);
+        if stages.refine > 0.0 {
+            let seen = (known.refine != UNSEEN_REFINE).then_some(known.refine);
+            known.refine = mix(seen, stages.refine / pixels);
+        }
     }
 }
 
@@ -102,6 +107,15 @@ mod tests {
             (pace.seconds().answer.unwrap() - 0.03).abs() < 1e-12,
             "no question says nothing of questions"
         );
+    }
+
+    #[test]
+    fn a_frame_that_was_not_refined_says_nothing_of_that() {
+        let pace = Pace::default();
+        pace.learn(1000, &StageSeconds { refine: 0.5, ..Default::default() }, 0);
+        let known = pace.seconds().refine;
+        pace.learn(1000, &StageSeconds { encode: 1.0, ..Default::default() }, 0);
+        assert_eq!(pace.seconds().refine, known);
     }
 
     #[test]

@@ -24,10 +24,19 @@ pub(super) struct Answers {
     pub(super) carried: Vec<Answered>,
     /// Measured pixels that were asked for the alignment.
     pub(super) anchors: Anchors,
+    /// Whether a map was expected before anything was asked.
+    pub(super) follows: bool,
     /// Pixels asked, those for the alignment included.
     pub(super) asked: usize,
     /// Distance between the plan's pixels where they lie least dense.
     pub(super) spacing: usize,
+}
+
+impl Answers {
+    /// Whether nothing at all is known but the measurements.
+    pub(super) fn is_empty(&self) -> bool {
+        self.readings.is_empty() && self.settled.is_empty() && self.carried.is_empty()
+    }
 }
 
 /// The questions about one frame.
@@ -229,12 +238,26 @@ impl<'a> Questions<'a> {
 }
 
 /// What is known of a frame before any question: its measurements, interpolated linearly, with confidence 0 where nothing was
-/// measured. The expected error is the difference to the nearest measurement.
-pub(super) fn interpolated(sparse: &SparseDepth, options: &CompleteOptions) -> Result<DepthMap> {
+/// measured. The expected error is the difference to the nearest measurement. Measurements are kept also where they would be asked;
+/// flagged ones as [`Questions::dense`] has them.
+pub(super) fn interpolated(
+    sparse: &SparseDepth,
+    flagged: &[(usize, usize, f32)],
+    options: &CompleteOptions,
+) -> Result<(DepthMap, Vec<Outlier>)> {
     let (width, height) = (sparse.width(), sparse.height());
     let (mut depth, nearest) = (interpolate::linear(sparse)?, interpolate::nearest(sparse)?);
     let mut error: Vec<f32> = depth.iter().zip(&nearest).map(|(a, b)| (a - b).abs()).collect();
-    let measured: Vec<bool> = sparse.as_slice().iter().map(|d| !d.is_nan()).collect();
+    let mut measured: Vec<bool> = sparse.as_slice().iter().map(|d| !d.is_nan()).collect();
+    let outlier =
+        |&(x, y, measured): &(usize, usize, f32)| Outlier { x, y, measured, expected: depth[y * width + x] };
+    let outliers = flagged.iter().map(outlier).collect();
+    if options.outliers == Outliers::Preserve {
+        for &(x, y, insisted) in flagged {
+            let i = y * width + x;
+            (depth[i], error[i], measured[i]) = (insisted, 0.0, true);
+        }
+    }
     let confidence = measured.iter().map(|&m| if m { 1.0 } else { 0.0 }).collect();
     let far = options.far_limit.unwrap_or(f32::INFINITY);
     for i in (0..depth.len()).filter(|&i| !measured[i]) {
@@ -243,5 +266,5 @@ pub(super) fn interpolated(sparse: &SparseDepth, options: &CompleteOptions) -> R
             (depth[i], error[i]) = (f32::NAN, f32::NAN);
         }
     }
-    DepthMap::new(width, height, depth, confidence, error, measured)
+    Ok((DepthMap::new(width, height, depth, confidence, error, measured)?, outliers))
 }

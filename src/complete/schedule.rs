@@ -108,7 +108,7 @@ impl Questions<'_> {
     }
 
     /// Distance between so many pixels spread evenly.
-    fn spacing_of(&self, pixels: usize) -> usize {
+    pub(super) fn spacing_of(&self, pixels: usize) -> usize {
         (self.region().pixels() as f64 / pixels.max(1) as f64).sqrt().ceil() as usize
     }
 
@@ -144,10 +144,13 @@ impl Questions<'_> {
         if left() < pace.answer.unwrap_or(0.0) * coarse.len() as f64 {
             return Ok(answers);
         }
+        if coarse.is_empty() {
+            return Ok(answers);
+        }
         let mark = Instant::now();
         self.ask_plan(&coarse, coarse.len(), &mut answers)?;
+        let mut seconds = mark.elapsed().as_secs_f64() / coarse.len() as f64;
         self.look(&answers, answers.asked);
-        let mut seconds = mark.elapsed().as_secs_f64() / coarse.len().max(1) as f64;
         let fitting = |seconds: f64| (left().max(0.0) / seconds.max(1e-9)) as usize;
         if self.options.align {
             let mark = Instant::now();
@@ -186,7 +189,7 @@ impl Questions<'_> {
         pixels: &[(usize, usize)],
         into: &mut Answers,
     ) -> Result<bool> {
-        let planned = into.asked + pixels.len();
+        let (planned, spacing) = (into.asked + pixels.len(), into.spacing);
         let mut rest = pixels;
         while !rest.is_empty() {
             let fits = (clock.left() - refine) / seconds.max(1e-9);
@@ -200,9 +203,11 @@ impl Questions<'_> {
             self.ask_plan(now, planned, into)?;
             *seconds = 0.5 * (*seconds + mark.elapsed().as_secs_f64() / count as f64);
             rest = later;
-            if self.options.preview.is_some() {
+            // In a frame that follows another one, what is carried comes last: there is no whole map before.
+            if self.options.preview.is_some() && !into.follows {
                 into.spacing = self.spacing_of(into.readings.len());
                 self.look(into, planned);
+                into.spacing = spacing;
             }
         }
         Ok(true)

@@ -9,7 +9,7 @@ use crate::error::{Error, Result};
 /// Weighted median filter: each answer becomes the median of the answers and measurements around it and of what the measurements
 /// say by linear interpolation, each weighted by nearness and by how sure it is.
 ///
-/// A median keeps edges and planes where they are, and an answer that is alone against its neighbours goes, unless it is sure. The window is
+/// A median keeps edges and planes where they are, and an answer that is alone against its neighbours goes. The window is
 /// Gaussian; at the border of the frame it is cut on both sides alike, so that a slanted plane is not bent there. What it is worth: decision 060.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MedianFilter {
@@ -18,15 +18,13 @@ pub struct MedianFilter {
     /// What is added to an answer's expected error, relative to its depth, before it is weighed: how little a sure answer may
     /// outweigh another one.
     pub doubt: f32,
-    /// An answer whose expected error, relative to its depth, is no more than this is not outvoted by those around it.
-    pub sure: f32,
     /// Weight of the linear interpolation of the measurements, relative to that of all answers together; 0 for none.
     pub interpolated: f32,
 }
 
 impl Default for MedianFilter {
     fn default() -> Self {
-        Self { sigma: 2.4, doubt: 0.03, sure: 0.02, interpolated: 0.15 }
+        Self { sigma: 1.7, doubt: 0.03, interpolated: 0.15 }
     }
 }
 
@@ -38,9 +36,6 @@ const REACH: f32 = 2.5;
 
 /// A cell is at least this part of the window's standard deviation wide, so that a window does not end too early.
 const CELL: f32 = 0.75;
-
-/// How often an answer may outweigh all others around it.
-const MOST: f32 = 50.0;
 
 /// Where the asked pixels lie, and how finely the model saw the frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -182,7 +177,6 @@ impl MedianFilter {
             ("sigma", self.sigma, f32::MIN_POSITIVE),
             ("doubt", self.doubt, f32::MIN_POSITIVE),
             ("pixel", pixel, f32::MIN_POSITIVE),
-            ("sure", self.sure, 0.0),
             ("interpolated", self.interpolated, 0.0),
         ] {
             if !(value.is_finite() && value >= least) {
@@ -206,7 +200,6 @@ impl MedianFilter {
         votes.clear();
         let own = Vote::from(a);
         let reach = REACH * cells.spacing as f32;
-        let mut others = 0.0;
         for vote in cells.around(a.x, a.y) {
             let (dx, dy) = (vote.x as f32 - a.x as f32, vote.y as f32 - a.y as f32);
             let inside = |at: usize, step: f32, size: usize| (0.0..size as f32).contains(&(at as f32 - step));
@@ -215,13 +208,9 @@ impl MedianFilter {
                 continue;
             }
             let near = (-0.5 * (dx * dx + dy * dy) / (deviation * deviation)).exp();
-            let weight = near / (self.doubt + vote.error / vote.depth);
-            others += weight;
-            votes.push((*vote, weight));
+            votes.push((*vote, near / (self.doubt + vote.error / vote.depth)));
         }
-        let unsure = own.error / own.depth;
-        let say = others * (self.sure / unsure).min(MOST);
-        votes.push((own, say.max(1.0 / (self.doubt + unsure))));
+        votes.push((own, 1.0 / (self.doubt + own.error / own.depth)));
     }
 
     fn elect(&self, votes: &mut [(Vote, f32)], a: &Answered, interpolated: Option<f32>) -> Answered {

@@ -26,7 +26,7 @@ pub struct EdgeAwareFill {
 
 impl Default for EdgeAwareFill {
     fn default() -> Self {
-        Self { edge_ratio: 0.25, colour_sigma: 40.0 }
+        Self { edge_ratio: 0.15, colour_sigma: 30.0 }
     }
 }
 

@@ -105,7 +105,8 @@ impl Stream {
     /// camera's axes (x right, y down, z forward) to those of the world. Any world will do as long as it stays the same.
     ///
     /// Without a pose, here or in the frame before, the last map counts where the picture is as it was. A frame of another size begins anew.
-    /// A frame that fails changes nothing: the next one follows the last that did not.
+    /// A frame that fails changes nothing: the next one follows the last that did not. Nor does one whose deadline left no time for any question:
+    /// it is the interpolation of its measurements.
     ///
     /// # Errors
     /// [`Error::Argument`] for a pose where the options hold no camera, and for a camera of another size than the frame's; as
@@ -132,6 +133,10 @@ impl Stream {
         let blocks = Blocks::new(rgb);
         let prior = self.expected(&blocks, size, pose);
         let done = self.completer.complete_after(rgb, sparse, &self.options.complete, prior.as_ref())?;
+        // What is only interpolated is no map to go on from.
+        if done.interpolated {
+            return Ok(done);
+        }
         self.turn = if prior.is_some() { self.turn.wrapping_add(1) } else { 0 };
         self.last = Some(Last { map: done.map.clone(), blocks, pose: pose.copied() });
         Ok(done)

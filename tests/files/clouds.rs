@@ -261,3 +261,19 @@ proptest! {
         }
     }
 }
+
+#[test]
+fn points_without_bytes_are_refused_however_many_are_announced() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("empty.pcd");
+    for data in ["binary", "binary_compressed", "ascii"] {
+        for names in ["x y z", "X Y Z"] {
+            let header = format!(
+                "FIELDS {names}\nSIZE 4 4 4\nTYPE F F F\nCOUNT 0 0 0\nPOINTS {}\nDATA {data}\n",
+                usize::MAX
+            );
+            std::fs::write(&path, header).unwrap();
+            assert!(matches!(PointCloud::read(&path), Err(Error::Format { .. })), "{names} {data}");
+        }
+    }
+}

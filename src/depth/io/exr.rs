@@ -1,7 +1,6 @@
 //! OpenEXR files with a channel of depth (the crate `exr`).
 
-use std::fs::File;
-use std::io::{Cursor, ErrorKind, Read};
+use std::io::{Cursor, ErrorKind};
 use std::path::Path;
 
 use exr::error::Error as ExrError;
@@ -12,8 +11,11 @@ use exr::prelude::{ReadChannels, ReadLayers, read};
 use super::raster::{Raster, Values};
 use crate::depth::pixels::{check_length, pixel_count};
 use crate::error::{Error, Result};
+use crate::files::read_within;
 
 const EXPECTED: &str = "an OpenEXR file with one channel, or one whose name ends in Z or Depth";
+/// Bytes of the largest file that is read.
+const LARGEST: u64 = 1 << 30;
 /// How often smaller a layer may be stored. Deflate shrinks 1032-fold, PIZ and DWA may do more with one flat colour.
 const SHRINKS: usize = 4096;
 
@@ -23,9 +25,7 @@ const SHRINKS: usize = 4096;
 /// [`Error::Io`]; [`Error::Format`] for a damaged file, a deep image, and where the channel is not clear (its names are listed);
 /// [`Error::ImageSize`].
 pub fn read_exr(path: &Path) -> Result<Raster> {
-    let mut bytes = Vec::new();
-    File::open(path).and_then(|mut file| file.read_to_end(&mut bytes)).map_err(Error::io(path))?;
-    decode(&bytes, path)
+    decode(&read_within(path, LARGEST)?, path)
 }
 
 fn decode(bytes: &[u8], path: &Path) -> Result<Raster> {
