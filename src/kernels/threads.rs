@@ -162,7 +162,8 @@ mod tests {
             "thread::scope",
             ".install(",
         ];
-        const KNOWN: [&str; 2] = ["kernels/threads.rs", "kernels/testing.rs"];
+        // A test and an example of `Latest` complete on a thread of their own, as its users do.
+        const KNOWN: [&str; 3] = ["kernels/threads.rs", "kernels/testing.rs", "stream/latest.rs"];
         let src = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("src");
         let (mut folders, mut found, mut files) = (vec![src.clone()], Vec::new(), 0);
         while let Some(folder) = folders.pop() {

@@ -159,8 +159,11 @@ impl MedianFilter {
             return Err(Error::argument("answer", format!("({}, {})", a.x, a.y), expected));
         }
         let deviation = self.sigma * sampling.pixel;
-        let cell = sampling.spacing.max((CELL * deviation).round() as usize).max(LEAST_SPACING);
-        let cells = Cells::new(input, cell.min(input.width.max(input.height)));
+        // Whole spacings, so that the votes around an answer lie on both sides of it alike.
+        let spacing = sampling.spacing.max(1);
+        let wide = (CELL * deviation / spacing as f32).round() as usize;
+        let cell = spacing.saturating_mul(wide.max(LEAST_SPACING.div_ceil(spacing)));
+        let cells = Cells::new(input, cell.clamp(1, input.width.max(input.height)));
         let one = |votes: &mut Vec<(Vote, f32)>, a: &Answered| {
             if !is_valid(a.depth) || input.sparse.get(a.x, a.y).is_some() {
                 return *a;
