@@ -26,6 +26,16 @@ pub(crate) fn read_within(path: &Path, limit: u64) -> Result<Vec<u8>> {
     Ok(bytes)
 }
 
+/// The extension of a file's name in lower case; empty where it has none.
+pub(crate) fn extension(path: &Path) -> String {
+    path.extension().and_then(|e| e.to_str()).unwrap_or("").to_ascii_lowercase()
+}
+
+/// The error for an extension that no reader or writer knows.
+pub(crate) fn unknown_extension(path: &Path, extension: &str, expected: &str) -> Error {
+    Error::format(path, format!("file name extension {extension:?}"), expected)
+}
+
 /// Writes the bytes beside the target and renames them into place: on any error the target is as it was before.
 pub(crate) fn write_whole(path: &Path, bytes: &[u8]) -> Result<()> {
     let part = part_path(path)?;

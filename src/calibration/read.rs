@@ -4,7 +4,8 @@ use std::path::Path;
 
 use super::types::{Calibration, CalibrationOptions};
 use super::{kitti, ros};
-use crate::error::{Error, Result};
+use crate::error::Result;
+use crate::files::{extension, unknown_extension};
 
 impl Calibration {
     /// Reads a file.
@@ -24,14 +25,10 @@ impl Calibration {
     /// [`Error::Argument`] for a KITTI file without the number of a camera, and for numbers that no camera or motion has.
     pub fn read(path: impl AsRef<Path>, options: &CalibrationOptions) -> Result<Self> {
         let path = path.as_ref();
-        let ending = path.extension().and_then(|e| e.to_str()).unwrap_or("").to_ascii_lowercase();
-        match ending.as_str() {
+        match extension(path).as_str() {
             "yaml" | "yml" => ros::read(path, options),
             "txt" => kitti::read(path, options),
-            other => {
-                let found = format!("file name extension {other:?}");
-                Err(Error::format(path, found, "yaml or yml (ROS), or txt (KITTI)"))
-            }
+            other => Err(unknown_extension(path, other, "yaml or yml (ROS), or txt (KITTI)")),
         }
     }
 }

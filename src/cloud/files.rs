@@ -4,8 +4,8 @@ use std::path::Path;
 
 use super::points::PointCloud;
 use super::{pcd, ply, velodyne};
-use crate::error::{Error, Result};
-use crate::files::{read_within, write_whole};
+use crate::error::Result;
+use crate::files::{extension, read_within, unknown_extension, write_whole};
 
 /// Bytes of a file, at most: a hundred million points.
 const LARGEST: u64 = 1 << 31;
@@ -27,11 +27,11 @@ impl PointCloud {
     /// [`Error::Io`]; [`Error::Format`] for a damaged file, one without x, y, z, one beyond 2 GiB and an unknown ending.
     pub fn read(path: impl AsRef<Path>) -> Result<Self> {
         let path = path.as_ref();
-        let decode: fn(&[u8], &Path) -> Result<Self> = match ending(path).as_str() {
+        let decode: fn(&[u8], &Path) -> Result<Self> = match extension(path).as_str() {
             "pcd" => pcd::decode,
             "ply" => ply::decode,
             "bin" => velodyne::decode,
-            other => return Err(unknown(path, other, "pcd, ply or bin")),
+            other => return Err(unknown_extension(path, other, "pcd, ply or bin")),
         };
         decode(&read_within(path, LARGEST)?, path)
     }
@@ -45,19 +45,11 @@ impl PointCloud {
     pub fn write(&self, path: impl AsRef<Path>) -> Result<()> {
         let path = path.as_ref();
         self.check()?;
-        let bytes = match ending(path).as_str() {
+        let bytes = match extension(path).as_str() {
             "pcd" => pcd::encode(self),
             "ply" => ply::encode(self),
-            other => return Err(unknown(path, other, "pcd or ply")),
+            other => return Err(unknown_extension(path, other, "pcd or ply")),
         };
         write_whole(path, &bytes)
     }
-}
-
-fn ending(path: &Path) -> String {
-    path.extension().and_then(|e| e.to_str()).unwrap_or("").to_ascii_lowercase()
-}
-
-fn unknown(path: &Path, ending: &str, expected: &str) -> Error {
-    Error::format(path, format!("file name extension {ending:?}"), expected)
 }

@@ -6,7 +6,6 @@ mod from_map;
 mod pcd;
 mod ply;
 mod points;
-mod scalar;
 mod velodyne;
 
 pub use from_map::CloudOptions;

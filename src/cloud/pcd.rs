@@ -4,7 +4,7 @@ use std::path::Path;
 
 use super::columns::{Columns, is_packed_colour};
 use super::points::PointCloud;
-use super::scalar::Scalar;
+use crate::depth::io::Scalar;
 use crate::depth::io::lzf;
 use crate::error::{Error, Result};
 

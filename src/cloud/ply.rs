@@ -4,7 +4,7 @@ use std::path::Path;
 
 use super::columns::Columns;
 use super::points::PointCloud;
-use super::scalar::Scalar;
+use crate::depth::io::Scalar;
 use crate::error::{Error, Result};
 
 const EXPECTED: &str = "a PLY file whose element `vertex` has x, y and z";

@@ -1,11 +1,9 @@
 //! The plan's lattice over an expected map: what is known in the cell of each of its pixels.
 
 use super::options::Region;
-use super::prior::Prior;
+use super::prior::{Prior, SAME_SURFACE};
 use crate::query::plan::lattice;
 
-/// Neighbouring pixels with a larger ratio of their depths stand at a depth edge.
-const EDGE: f32 = 1.06;
 /// A cell with an edge is asked once in so many turns.
 const EDGE_TURNS: usize = 2;
 /// A cell is asked where more than this share of its pixels is unknown.
@@ -41,9 +39,7 @@ pub(super) struct Cells {
 impl Cells {
     /// The lattice of a region, over what is expected of a frame of this width.
     pub(super) fn new(prior: &Prior, width: usize, region: Region, stride: usize) -> Self {
-        let pixels: Vec<(usize, usize)> = (lattice(region.width, region.height, stride).into_iter())
-            .map(|(x, y)| (x + region.x, y + region.y))
-            .collect();
+        let pixels = region.lattice(lattice, stride);
         let first = pixels.first().copied().unwrap_or_default();
         let columns = pixels.iter().take_while(|p| p.1 == first.1).count().max(1);
         let cells = pixels.iter().map(|&pixel| Cell { pixel, ..Cell::default() }).collect();
@@ -72,7 +68,7 @@ impl Cells {
         let beside = [(x + 1, y), (x, y + 1)];
         for (u, v) in beside.into_iter().filter(|&(u, v)| region.contains(u, v)) {
             let other = prior.depth[v * width + u];
-            if depth.max(other) > EDGE * depth.min(other) {
+            if depth.max(other) > SAME_SURFACE * depth.min(other) {
                 let beyond = self.at((u, v));
                 self.cells[at].edge = true;
                 self.cells[beyond].edge = true;

@@ -4,7 +4,7 @@ use super::alignment::{Alignment, Anchors};
 use super::cells::{Cell, Cells};
 use super::pace::{Clock, Seconds};
 use super::prior::Prior;
-use super::questions::{Answers, Questions};
+use super::questions::{Answers, Questions, answered};
 use crate::error::Result;
 use crate::query::plan::stride_within;
 use crate::query::told::choose_evenly;
@@ -77,8 +77,8 @@ impl Questions<'_> {
         };
         let first: Vec<_> = cells.iter().enumerate().filter(due).map(|(_, cell)| cell.pixel).collect();
         if self.options.align {
-            let fitting = clock.map(|clock| ((clock.left() - refine) / seconds.max(1e-9)).max(0.0) as usize);
-            let most = fitting.map_or(usize::MAX, |all| all / ANCHOR_SHARE);
+            let fitting = |clock: Clock| clock.fits(refine, seconds) as usize;
+            let most = clock.map_or(usize::MAX, |clock| fitting(clock) / ANCHOR_SHARE);
             let count = (first.len() / ANCHOR_SHARE).clamp(ANCHORS.0, ANCHORS.1).min(most);
             let measured = choose_evenly(self.sparse, count, 0);
             let planned = measured.len() + first.len();
@@ -86,18 +86,22 @@ impl Questions<'_> {
         }
         let asked: HashSet<(usize, usize)> = first.iter().copied().collect();
         let mut whole = ask(first, &mut answers, &mut seconds)?;
-        for answer in self.aligned(&answers)? {
+        let by_answers = self.alignment(&answers)?;
+        answers.settled = self.aligned_by(by_answers.as_ref(), &std::mem::take(&mut answers.readings));
+        for answer in &answers.settled {
             let cell = cells.at((answer.x, answer.y));
-            if !cells.get(cell).ask && contradicts(prior, answer.y * width + answer.x, &answer) {
+            if !cells.get(cell).ask && contradicts(prior, answer.y * width + answer.x, answer) {
                 cells.forget(cell, AROUND);
             }
         }
         let late = |cell: &&Cell| cell.ask && !asked.contains(&cell.pixel) && self.wanted(cell.pixel);
         let second: Vec<_> = cells.iter().filter(late).map(|cell| cell.pixel).collect();
         whole &= ask(second, &mut answers, &mut seconds)?;
-        self.settle(prior, &cells, alignment.as_ref(), &mut answers)?;
+        let late = self.aligned_by(by_answers.as_ref(), &std::mem::take(&mut answers.readings));
+        answers.settled.extend(late);
+        self.settle(prior, &cells, alignment.as_ref(), &mut answers);
         if !whole {
-            let known = answers.settled.len() + answers.readings.len() + answers.carried.len();
+            let known = answers.settled.len() + answers.carried.len();
             answers.spacing = self.spacing_of(known).max(stride);
         }
         Ok(answers)
@@ -129,13 +133,7 @@ impl Questions<'_> {
     }
 
     /// Puts answers and what was expected together.
-    fn settle(
-        &self,
-        prior: &Prior,
-        cells: &Cells,
-        alignment: Option<&Alignment>,
-        answers: &mut Answers,
-    ) -> Result<()> {
+    fn settle(&self, prior: &Prior, cells: &Cells, alignment: Option<&Alignment>, answers: &mut Answers) {
         let width = self.size().0;
         let expected = |pixel: usize| {
             let reading = Reading {
@@ -145,27 +143,22 @@ impl Questions<'_> {
             };
             let at = (pixel % width, pixel / width);
             let moved = alignment.filter(|_| !reading.value.is_nan()).map(|a| a.apply(at, reading));
-            let Reading { value: depth, confidence, expected_error } = moved.unwrap_or(reading);
-            Answered { x: at.0, y: at.1, depth, confidence, expected_error }
+            answered(at, moved.unwrap_or(reading))
         };
-        let mut answered = HashSet::new();
-        let mut settled = self.aligned(answers)?;
-        for answer in &mut settled {
-            answered.insert((answer.x, answer.y));
+        let mut said = HashSet::new();
+        for answer in &mut answers.settled {
+            said.insert((answer.x, answer.y));
             let cell = cells.get(cells.at((answer.x, answer.y)));
             let before = expected(answer.y * width + answer.x);
             if !cell.forgotten && (answer.depth / before.depth).ln().abs() <= ALIKE {
                 *answer = averaged(answer, &before);
             }
         }
-        let kept = cells.iter().filter(|c| !(c.forgotten || c.ask && answered.contains(&c.pixel)));
+        let kept = cells.iter().filter(|c| !(c.forgotten || c.ask && said.contains(&c.pixel)));
         let kept = kept.filter_map(|c| c.best).map(|(pixel, _)| expected(pixel));
         answers.carried = kept
-            .filter(|a| self.wanted((a.x, a.y)) && !answered.contains(&(a.x, a.y)) && a.depth.is_finite())
+            .filter(|a| self.wanted((a.x, a.y)) && !said.contains(&(a.x, a.y)) && a.depth.is_finite())
             .collect();
-        answers.settled = settled;
-        answers.readings.clear();
-        Ok(())
     }
 }
 

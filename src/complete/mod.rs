@@ -15,7 +15,7 @@ pub use options::{
     CancelToken, CompleteOptions, Outliers, Partial, Preserve, PreviewCallback, Progress, ProgressCallback,
     Region,
 };
-pub(crate) use prior::Prior;
+pub(crate) use prior::{Prior, SAME_SURFACE};
 pub use stages::StageSeconds;
 
 use crate::depth::outliers::Outlier;

@@ -100,6 +100,20 @@ impl Region {
         inside(x, self.x, self.width) && inside(y, self.y, self.height)
     }
 
+    /// The pixels of the frame that a plan's order of a lattice has in it.
+    pub(super) fn lattice(
+        &self,
+        order: fn(usize, usize, usize) -> Vec<(usize, usize)>,
+        stride: usize,
+    ) -> Vec<(usize, usize)> {
+        order(self.width, self.height, stride).into_iter().map(|pixel| self.place(pixel)).collect()
+    }
+
+    /// The pixel of the frame at this column and row of the region.
+    pub(super) fn place(&self, (x, y): (usize, usize)) -> (usize, usize) {
+        (x + self.x, y + self.y)
+    }
+
     /// How many pixels it has.
     pub(crate) fn pixels(&self) -> usize {
         self.width * self.height

@@ -77,6 +77,11 @@ impl Clock {
         self.time.as_secs_f64() - self.start.elapsed().as_secs_f64()
     }
 
+    /// How many answers of so many seconds each fit into the time that is left, `reserved` seconds kept; less than 0 afterwards.
+    pub(super) fn fits(&self, reserved: f64, answer: f64) -> f64 {
+        (self.left() - reserved) / answer.max(1e-9)
+    }
+
     /// All of it, seconds.
     pub(super) fn all(&self) -> f64 {
         self.time.as_secs_f64()

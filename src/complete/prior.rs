@@ -1,5 +1,8 @@
 //! What is expected of a frame before it is looked at.
 
+/// Neighbouring pixels with a larger ratio of their depths lie on different surfaces.
+pub(crate) const SAME_SURFACE: f32 = 1.06;
+
 /// A map of a frame that is expected before anything is asked about it: the last frame's, moved along with the camera.
 #[derive(Debug, Clone)]
 pub(crate) struct Prior {

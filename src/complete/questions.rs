@@ -7,7 +7,7 @@ use crate::depth::{DepthMap, SparseDepth, interpolate};
 use crate::error::Result;
 use crate::model::{AskOptions, Prefix, SdimModel, ask};
 use crate::query::{Hint, Query, Reading};
-use crate::refine::{Answered, FillInput, Sampling};
+use crate::refine::{Answered, FillInput, Filled, Sampling};
 use image::RgbImage;
 
 /// Answers that lie at most so many pixels apart speak for the measurements between them, too.
@@ -147,58 +147,57 @@ impl<'a> Questions<'a> {
 
     /// Readable answers, aligned to the measurements.
     pub(super) fn aligned(&self, answers: &Answers) -> Result<Vec<Answered>> {
-        let (width, height) = self.size();
-        let alignment = Alignment::new(answers.anchors.clone(), width, height)?;
-        let readable = answers.readings.iter().filter(|(_, a)| a.value.is_finite() && a.value > 0.0);
-        let aligned = readable.map(|&((x, y), answer)| {
-            let aligned = match &alignment {
-                Some(alignment) if !self.told((x, y)) => alignment.apply((x, y), answer),
-                _ => answer,
-            };
-            Answered {
-                x,
-                y,
-                depth: aligned.value,
-                confidence: aligned.confidence,
-                expected_error: aligned.expected_error,
-            }
-        });
-        Ok(aligned.collect())
+        Ok(self.aligned_by(self.alignment(answers)?.as_ref(), &answers.readings))
     }
 
-    /// All that is known of the frame, aligned.
+    /// What the answers at measured pixels say of all others.
+    pub(super) fn alignment(&self, answers: &Answers) -> Result<Option<Alignment>> {
+        let (width, height) = self.size();
+        Alignment::new(answers.anchors.clone(), width, height)
+    }
+
+    /// Those of the readings that are readable, aligned.
+    pub(super) fn aligned_by(
+        &self,
+        alignment: Option<&Alignment>,
+        readings: &[((usize, usize), Reading)],
+    ) -> Vec<Answered> {
+        let readable = readings.iter().filter(|(_, a)| a.value.is_finite() && a.value > 0.0);
+        let aligned = readable.map(|&(pixel, reading)| match alignment {
+            Some(alignment) if !self.told(pixel) => answered(pixel, alignment.apply(pixel, reading)),
+            _ => answered(pixel, reading),
+        });
+        aligned.collect()
+    }
+
+    /// All that is known of the frame: aligned answers, read together with those around them, and what was carried, which has been through the
+    /// filter when it was answered. Measurements have a say also where they are not kept; an answer that was told its measurement stays as it is.
     fn known(&self, answers: &Answers) -> Result<Vec<Answered>> {
         let mut known = self.aligned(answers)?;
         known.extend(&answers.settled);
+        let fresh = known.len();
         known.extend(&answers.carried);
-        Ok(known)
-    }
-
-    /// Aligned answers, read together with those around them. Measurements have a say also where they are not kept; an answer that
-    /// was told its measurement stays as it is.
-    fn filtered(&self, asked: Vec<Answered>, spacing: usize) -> Result<Vec<Answered>> {
         let Some(filter) = &self.options.filter else {
-            return Ok(asked);
+            return Ok(known);
         };
         let (width, height) = self.size();
         let interpolated = match self.hint.is_empty() {
             true => &interpolate::linear(self.sparse)?,
             false => &self.hint,
         };
-        let input = FillInput { width, height, rgb: self.rgb, asked: &asked, sparse: self.sparse };
+        let input = FillInput { width, height, rgb: self.rgb, asked: &known, sparse: self.sparse };
         let pixel = width as f32 / self.prefix.space.resized.0.max(1) as f32;
-        filter.apply(&input, interpolated, Sampling { spacing, pixel })
+        let sampling = Sampling { spacing: answers.spacing, pixel };
+        let mut read = filter.read(&known[..fresh], &input, interpolated, sampling)?;
+        read.extend(&answers.carried);
+        Ok(read)
     }
 
     /// The dense map of what was answered so far: answers are aligned, read together and filled in between, measurements are kept.
     /// And what is expected at the flagged ones, which are kept where the caller insists.
     pub(super) fn dense(&self, answers: &Answers) -> Result<(DepthMap, Vec<Outlier>)> {
         let (width, height) = self.size();
-        let mut asked = self.filtered(self.known(answers)?, answers.spacing)?;
-        // What was expected has been through the filter already, when it was answered.
-        let fresh = asked.len() - answers.carried.len();
-        asked.truncate(fresh);
-        asked.extend(&answers.carried);
+        let asked = self.known(answers)?;
         let none = SparseDepth::from_points(width, height, &[])?;
         let kept = if self.options.preserve == Preserve::Keep { self.sparse } else { &none };
         // What was measured between answers that lie this close has been heard by the filter; as corners of the fill such pixels would be
@@ -207,13 +206,7 @@ impl<'a> Questions<'a> {
         let corners = if heard { &none } else { kept };
         let input = FillInput { width, height, rgb: self.rgb, asked: &asked, sparse: corners };
         let mut filled = self.options.fill.fill(&input)?;
-        let expected = |&(x, y, measured): &(usize, usize, f32)| Outlier {
-            x,
-            y,
-            measured,
-            expected: filled.depth[y * width + x],
-        };
-        let outliers = self.flagged.iter().map(expected).collect();
+        let outliers = expected_at(self.flagged, &filled.depth, width);
         let insisted = if self.options.outliers == Outliers::Preserve { self.flagged } else { &[] };
         let mut measured = vec![false; width * height];
         if self.options.preserve == Preserve::Keep {
@@ -225,15 +218,34 @@ impl<'a> Questions<'a> {
                 filled.expected_error[i] = 0.0;
             }
         }
-        let (region, far) = (self.region(), self.options.far_limit.unwrap_or(f32::INFINITY));
-        for (i, depth) in filled.depth.iter_mut().enumerate().filter(|(i, _)| !measured[*i]) {
-            if *depth > far || !region.contains(i % width, i / width) {
-                (*depth, filled.confidence[i], filled.expected_error[i]) = (f32::NAN, 0.0, f32::NAN);
-            }
-        }
+        leave_out(self.options, width, &measured, &mut filled);
         let map =
             DepthMap::new(width, height, filled.depth, filled.confidence, filled.expected_error, measured)?;
         Ok((map, outliers))
+    }
+}
+
+/// What is said at a pixel.
+pub(super) fn answered((x, y): (usize, usize), reading: Reading) -> Answered {
+    let Reading { value: depth, confidence, expected_error } = reading;
+    Answered { x, y, depth, confidence, expected_error }
+}
+
+/// What a map has at flagged measurements.
+fn expected_at(flagged: &[(usize, usize, f32)], depth: &[f32], width: usize) -> Vec<Outlier> {
+    let outlier =
+        |&(x, y, measured): &(usize, usize, f32)| Outlier { x, y, measured, expected: depth[y * width + x] };
+    flagged.iter().map(outlier).collect()
+}
+
+/// Makes what is not measured invalid beyond the far limit and outside of the region.
+fn leave_out(options: &CompleteOptions, width: usize, measured: &[bool], map: &mut Filled) {
+    let far = options.far_limit.unwrap_or(f32::INFINITY);
+    for (i, depth) in map.depth.iter_mut().enumerate().filter(|(i, _)| !measured[*i]) {
+        let inside = options.region.is_none_or(|region| region.contains(i % width, i / width));
+        if *depth > far || !inside {
+            (*depth, map.confidence[i], map.expected_error[i]) = (f32::NAN, 0.0, f32::NAN);
+        }
     }
 }
 
@@ -247,24 +259,18 @@ pub(super) fn interpolated(
 ) -> Result<(DepthMap, Vec<Outlier>)> {
     let (width, height) = (sparse.width(), sparse.height());
     let (mut depth, nearest) = (interpolate::linear(sparse)?, interpolate::nearest(sparse)?);
-    let mut error: Vec<f32> = depth.iter().zip(&nearest).map(|(a, b)| (a - b).abs()).collect();
+    let mut expected_error: Vec<f32> = depth.iter().zip(&nearest).map(|(a, b)| (a - b).abs()).collect();
     let mut measured: Vec<bool> = sparse.as_slice().iter().map(|d| !d.is_nan()).collect();
-    let outlier =
-        |&(x, y, measured): &(usize, usize, f32)| Outlier { x, y, measured, expected: depth[y * width + x] };
-    let outliers = flagged.iter().map(outlier).collect();
+    let outliers = expected_at(flagged, &depth, width);
     if options.outliers == Outliers::Preserve {
         for &(x, y, insisted) in flagged {
             let i = y * width + x;
-            (depth[i], error[i], measured[i]) = (insisted, 0.0, true);
+            (depth[i], expected_error[i], measured[i]) = (insisted, 0.0, true);
         }
     }
     let confidence = measured.iter().map(|&m| if m { 1.0 } else { 0.0 }).collect();
-    let far = options.far_limit.unwrap_or(f32::INFINITY);
-    for i in (0..depth.len()).filter(|&i| !measured[i]) {
-        let inside = options.region.is_none_or(|region| region.contains(i % width, i / width));
-        if depth[i] > far || !inside {
-            (depth[i], error[i]) = (f32::NAN, f32::NAN);
-        }
-    }
-    Ok((DepthMap::new(width, height, depth, confidence, error, measured)?, outliers))
+    let mut map = Filled { depth, confidence, expected_error };
+    leave_out(options, width, &measured, &mut map);
+    let Filled { depth, confidence, expected_error } = map;
+    Ok((DepthMap::new(width, height, depth, confidence, expected_error, measured)?, outliers))
 }

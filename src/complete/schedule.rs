@@ -7,7 +7,7 @@ use crate::error::Result;
 use crate::query::QueryPlan;
 use crate::query::plan::{Asked, coarse_to_fine, lattice, refine_pixels, stride_within};
 use crate::query::told::choose_evenly;
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::time::Instant;
 
 /// Measurements asked for the alignment, at most; more are chosen spatially even.
@@ -38,16 +38,13 @@ impl Questions<'_> {
                 None => 1,
             },
         };
-        let coarse = self.lattice(stride);
+        let coarse = self.first_lattice(stride);
         let all = self.all_wanted();
         let budget = match self.options.plan {
             QueryPlan::Budget(n) => n.min(all).saturating_sub(coarse.len()),
             _ => 0,
         };
-        let anchors = match self.options.align && coarse.len() + budget > 0 {
-            true => choose_evenly(self.sparse, ALIGN_POINTS, 0),
-            false => Vec::new(),
-        };
+        let anchors = self.chosen_anchors(coarse.len() + budget);
         let planned = coarse.len() + budget + anchors.len();
         let mut answers = Answers { spacing: stride, ..Default::default() };
         // First, so that what is looked at meanwhile is aligned.
@@ -66,15 +63,20 @@ impl Questions<'_> {
         let mut wanted: Vec<_> = pixels.iter().copied().filter(|&p| self.wanted(p)).collect();
         wanted.sort_unstable();
         wanted.dedup();
-        let anchors = match self.options.align && !wanted.is_empty() {
-            true => choose_evenly(self.sparse, ALIGN_POINTS, 0),
-            false => Vec::new(),
-        };
+        let anchors = self.chosen_anchors(wanted.len());
         let planned = wanted.len() + anchors.len();
         let mut answers = Answers { spacing: 1, ..Default::default() };
         self.ask_anchors(anchors, planned, &mut answers)?;
         self.ask_plan(&wanted, planned, &mut answers)?;
         Ok(answers)
+    }
+
+    /// The measured pixels that so many answers are aligned by.
+    fn chosen_anchors(&self, answers: usize) -> Vec<(usize, usize, f32)> {
+        match self.options.align && answers > 0 {
+            true => choose_evenly(self.sparse, ALIGN_POINTS, 0),
+            false => Vec::new(),
+        }
     }
 
     /// How many pixels the whole region wants asked.
@@ -84,12 +86,20 @@ impl Questions<'_> {
         rows.map(|y| (region.x..region.x + region.width).filter(|&x| self.wanted((x, y))).count()).sum()
     }
 
-    /// The pixels of a lattice over the region that want an answer, in the order in which they are asked.
-    fn lattice(&self, stride: usize) -> Vec<(usize, usize)> {
-        let region = self.region();
-        let order = if self.options.preview.is_some() { coarse_to_fine } else { lattice };
-        let pixels = order(region.width, region.height, stride).into_iter();
-        pixels.map(|(x, y)| (x + region.x, y + region.y)).filter(|&p| self.wanted(p)).collect()
+    /// The lattice that is asked first, coarse to fine where somebody looks meanwhile.
+    fn first_lattice(&self, stride: usize) -> Vec<(usize, usize)> {
+        self.wanted_of(if self.options.preview.is_some() { coarse_to_fine } else { lattice }, stride)
+    }
+
+    /// The pixels of a lattice over the region that want an answer.
+    fn wanted_of(
+        &self,
+        order: fn(usize, usize, usize) -> Vec<(usize, usize)>,
+        stride: usize,
+    ) -> Vec<(usize, usize)> {
+        let mut pixels = self.region().lattice(order, stride);
+        pixels.retain(|&pixel| self.wanted(pixel));
+        pixels
     }
 
     /// Asks pixels, all at once unless somebody looks at the map meanwhile.
@@ -118,17 +128,19 @@ impl Questions<'_> {
         let known: HashMap<(usize, usize), Asked> = (answers.readings.iter())
             .map(|(p, r)| (*p, Asked { depth: r.value, expected_error: r.expected_error }))
             .collect();
-        let at = |(x, y): (usize, usize)| (x + region.x, y + region.y);
-        let corners: Vec<Asked> = (lattice(region.width, region.height, stride).into_iter().map(at))
+        let corners: Vec<Asked> = (region.lattice(lattice, stride).into_iter())
             .map(|p| match known.get(&p) {
                 Some(asked) => *asked,
                 // A measured pixel that was not asked is sure of its depth.
                 None => Asked { depth: self.sparse.get(p.0, p.1).unwrap_or(f32::NAN), expected_error: 0.0 },
             })
             .collect();
-        let wanted = |x, y| self.wanted(at((x, y))) && !known.contains_key(&at((x, y)));
+        let wanted = |x, y| {
+            let pixel = region.place((x, y));
+            self.wanted(pixel) && !known.contains_key(&pixel)
+        };
         let more = refine_pixels(region.width, region.height, stride, &corners, budget, wanted);
-        more.into_iter().map(at).collect()
+        more.into_iter().map(|pixel| region.place(pixel)).collect()
     }
 
     /// Asks as much as the time allows. A coarse lattice comes first, so that there is always a whole map; nothing is asked where not even
@@ -136,22 +148,20 @@ impl Questions<'_> {
     fn ask_until(&self, clock: Clock, pace: Seconds) -> Result<Answers> {
         let (width, height) = self.size();
         let refine = pace.refine * (width * height) as f64;
-        let left = || clock.left() - refine;
         let region = self.region();
         let stride = stride_within(region.width, region.height, COARSE);
         let mut answers = Answers { spacing: stride, ..Default::default() };
-        let coarse = self.lattice(stride);
-        if left() < pace.answer.unwrap_or(0.0) * coarse.len() as f64 {
-            return Ok(answers);
-        }
-        if coarse.is_empty() {
+        let coarse = self.first_lattice(stride);
+        let late = clock.left() - refine < pace.answer.unwrap_or(0.0) * coarse.len() as f64;
+        if late || coarse.is_empty() {
             return Ok(answers);
         }
         let mark = Instant::now();
         self.ask_plan(&coarse, coarse.len(), &mut answers)?;
         let mut seconds = mark.elapsed().as_secs_f64() / coarse.len() as f64;
         self.look(&answers, answers.asked);
-        let fitting = |seconds: f64| (left().max(0.0) / seconds.max(1e-9)) as usize;
+        // Less than nothing becomes 0.
+        let fitting = |seconds: f64| clock.fits(refine, seconds) as usize;
         if self.options.align {
             let mark = Instant::now();
             let anchors = choose_evenly(self.sparse, ALIGN_POINTS.min(fitting(seconds) / ALIGN_SHARE), 0);
@@ -166,10 +176,9 @@ impl Questions<'_> {
             return Ok(answers);
         }
         let fine = stride_within(region.width, region.height, all.div_ceil(2).max(COARSE)).min(stride);
-        let asked: HashMap<(usize, usize), ()> = answers.readings.iter().map(|(p, _)| (*p, ())).collect();
-        let order = coarse_to_fine(region.width, region.height, fine).into_iter();
-        let at = order.map(|(x, y)| (x + region.x, y + region.y));
-        let pixels: Vec<_> = at.filter(|p| self.wanted(*p) && !asked.contains_key(p)).collect();
+        let asked: HashSet<(usize, usize)> = answers.readings.iter().map(|(pixel, _)| *pixel).collect();
+        let mut pixels = self.wanted_of(coarse_to_fine, fine);
+        pixels.retain(|pixel| !asked.contains(pixel));
         if !self.ask_while(&clock, refine, &mut seconds, &pixels, &mut answers)? {
             answers.spacing = self.spacing_of(answers.readings.len());
             return Ok(answers);
@@ -192,7 +201,7 @@ impl Questions<'_> {
         let (planned, spacing) = (into.asked + pixels.len(), into.spacing);
         let mut rest = pixels;
         while !rest.is_empty() {
-            let fits = (clock.left() - refine) / seconds.max(1e-9);
+            let fits = clock.fits(refine, *seconds);
             let tick = (TICK * clock.all() / seconds.max(1e-9)) as usize;
             let count = tick.clamp(CHUNK.0, CHUNK.1).min(rest.len());
             if fits < count as f64 {

@@ -94,11 +94,7 @@ impl SparseDepth {
         visibility: &Visibility,
     ) -> Result<(Self, ProjectionReport)> {
         let (width, height) = (self.width(), self.height());
-        if (width, height) != (depth_camera.width(), depth_camera.height()) {
-            let expected = format!("the size of the depth map, {width}x{height}");
-            let found = format!("{}x{}", depth_camera.width(), depth_camera.height());
-            return Err(Error::argument("depth camera", found, expected));
-        }
+        depth_camera.require_size("depth camera", "the size of the depth map", (width, height))?;
         let mut view = View::new(colour_camera)?;
         // Lenses take the time, so rows are shared out; the pixels are drawn in their order, whatever the number of threads.
         let row = |y: usize| -> Vec<Place> {

@@ -184,14 +184,19 @@ impl DepthMap {
     /// # Errors
     /// [`Error::Format`] if the encoder fails.
     pub fn to_png16(&self, scale: DepthScale) -> Result<(Vec<u8>, Saturation)> {
+        let (stored, saturation) = self.stored(scale);
+        Ok((png16::encode(self.width, self.height, &stored)?, saturation))
+    }
+
+    /// The depth in units of `scale`, 0 where invalid.
+    pub(crate) fn stored(&self, scale: DepthScale) -> (Vec<u16>, Saturation) {
         let mut pixels = 0;
         let store = |&depth: &f32| {
             let (stored, saturated) = scale.stored(depth);
             pixels += usize::from(saturated);
             stored
         };
-        let stored: Vec<u16> = self.depth.iter().map(store).collect();
-        Ok((png16::encode(self.width, self.height, &stored)?, Saturation { pixels }))
+        (self.depth.iter().map(store).collect(), Saturation { pixels })
     }
 
     /// Writes [`DepthMap::to_png16`] to a file; reports how many pixels were too far for it.

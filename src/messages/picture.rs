@@ -91,14 +91,9 @@ impl Image {
     /// A map as `16UC1` in units of `scale`, 0 where invalid, little-endian; REP 118 lays down millimetres. Also says how many pixels are too
     /// far for it.
     pub fn from_depth_u16(map: &DepthMap, scale: DepthScale) -> (Self, Saturation) {
-        let mut pixels = 0;
-        let store = |&metres: &f32| {
-            let (stored, saturated) = scale.stored(metres);
-            pixels += usize::from(saturated);
-            stored.to_le_bytes()
-        };
-        let data = map.depth().iter().flat_map(store).collect();
-        (Self::little_endian("16UC1", map, 2, data), Saturation { pixels })
+        let (stored, saturation) = map.stored(scale);
+        let data = stored.into_iter().flat_map(u16::to_le_bytes).collect();
+        (Self::little_endian("16UC1", map, 2, data), saturation)
     }
 
     fn little_endian(encoding: &str, map: &DepthMap, bytes: u32, data: Vec<u8>) -> Self {

@@ -149,6 +149,17 @@ impl MedianFilter {
         interpolated: &[f32],
         sampling: Sampling,
     ) -> Result<Vec<Answered>> {
+        self.read(input.asked, input, interpolated, sampling)
+    }
+
+    /// As [`MedianFilter::apply`], for some of the answers alone; all of `input` have a say.
+    pub(crate) fn read(
+        &self,
+        some: &[Answered],
+        input: &FillInput,
+        interpolated: &[f32],
+        sampling: Sampling,
+    ) -> Result<Vec<Answered>> {
         self.check(sampling.pixel)?;
         let pixels = pixel_count(input.width, input.height)?;
         if !interpolated.is_empty() {
@@ -172,7 +183,7 @@ impl MedianFilter {
             let hint = interpolated.get(a.y * input.width + a.x).copied().filter(|d| is_valid(*d));
             self.elect(votes, a, hint)
         };
-        Ok(input.asked.par_iter().map_init(Vec::new, one).collect())
+        Ok(some.par_iter().map_init(Vec::new, one).collect())
     }
 
     fn check(&self, pixel: f32) -> Result<()> {

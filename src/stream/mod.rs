@@ -123,12 +123,8 @@ impl Stream {
                 let expected = "none, or a camera in the stream's options";
                 return Err(Error::argument("pose", "a pose", expected));
             }
-            (Some(_), Some(camera)) if (camera.width(), camera.height()) != size => {
-                let found = format!("{}x{}", camera.width(), camera.height());
-                let expected = format!("the frame's size, {}x{}", size.0, size.1);
-                return Err(Error::argument("camera", found, expected));
-            }
-            _ => {}
+            (Some(_), Some(camera)) => camera.require_size("camera", "the frame's size", size)?,
+            (None, _) => {}
         }
         let blocks = Blocks::new(rgb);
         let prior = self.expected(&blocks, size, pose);

@@ -1,11 +1,9 @@
 //! A map as it looks from where the camera is now.
 
 use super::picture::Blocks;
-use crate::complete::Prior;
+use crate::complete::{Prior, SAME_SURFACE};
 use crate::depth::{Camera, DepthMap, Transform};
 
-/// Neighbouring pixels with a larger ratio of their depths lie on different surfaces.
-const SAME_SURFACE: f32 = 1.06;
 /// Of two depths that come to one pixel the nearer one counts, unless they are as alike as this: then the one that comes closer to the
 /// pixel's centre.
 const ALIKE: f32 = 1.02;

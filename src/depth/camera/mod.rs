@@ -60,6 +60,20 @@ pub struct Camera {
 }
 
 impl Camera {
+    /// Fails unless the camera's pictures have the size of what is named, `of`.
+    pub(crate) fn require_size(
+        &self,
+        name: &'static str,
+        of: &str,
+        (width, height): (usize, usize),
+    ) -> Result<()> {
+        if (self.width, self.height) == (width, height) {
+            return Ok(());
+        }
+        let found = format!("{}x{}", self.width, self.height);
+        Err(Error::argument(name, found, format!("{of}, {width}x{height}")))
+    }
+
     /// From a calibration of the picture as it is: intrinsics and distortion of the raw one, or those of a rectified one, which has
     /// [`Distortion::None`].
     ///

@@ -52,12 +52,8 @@ fn decode(bytes: &[u8], path: &Path) -> Result<Raster> {
         Some(FlatSamples::U32(v)) => Values::Integers(v.into_iter().map(i64::from).collect()),
         None => return Err(Error::format(path, "no channel", EXPECTED)),
     };
-    let found = match &values {
-        Values::Floats(v) => v.len(),
-        Values::Integers(v) => v.len(),
-    };
     // Fewer where the channel is subsampled.
-    check_length("OpenEXR channel", found, pixels)?;
+    check_length("OpenEXR channel", values.len(), pixels)?;
     Ok(Raster { width, height, values })
 }
 

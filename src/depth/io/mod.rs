@@ -8,16 +8,21 @@ pub(crate) mod npy;
 mod npz;
 pub(crate) mod png16;
 mod raster;
+mod scalar;
 #[cfg(feature = "tiff")]
 mod tiff;
 
 use std::path::Path;
 
-use crate::error::{Error, Result};
+#[cfg(not(all(feature = "tiff", feature = "exr")))]
+use crate::error::Error;
+use crate::error::Result;
+use crate::files::{extension, unknown_extension};
 
 pub use npy::write_npy;
 pub use png16::{read_png16, write_png16};
 pub(crate) use raster::{Raster, Values};
+pub(crate) use scalar::Scalar;
 
 /// A depth file of any kind by its name; behind `.npz` may stand `:` and the name of an array.
 ///
@@ -27,8 +32,7 @@ pub(super) fn read(path: &Path) -> Result<Raster> {
     if let Some((archive, name)) = named_array(path) {
         return npz::read_npz(archive, Some(name));
     }
-    let ending = path.extension().and_then(|e| e.to_str()).unwrap_or("").to_ascii_lowercase();
-    match ending.as_str() {
+    match extension(path).as_str() {
         "png" => {
             let (width, height, stored) = png16::read_png16(path)?;
             let values = Values::Integers(stored.into_iter().map(i64::from).collect());
@@ -44,10 +48,7 @@ pub(super) fn read(path: &Path) -> Result<Raster> {
         "exr" => exr::read_exr(path),
         #[cfg(not(feature = "exr"))]
         "exr" => Err(Error::format(path, "an OpenEXR file", "a build with the feature `exr`")),
-        _ => {
-            let found = format!("file name extension {ending:?}");
-            Err(Error::format(path, found, "png, npy, npz, tif, tiff or exr"))
-        }
+        other => Err(unknown_extension(path, other, "png, npy, npz, tif, tiff or exr")),
     }
 }
 

@@ -21,6 +21,15 @@ pub enum Values {
 }
 
 impl Values {
+    /// How many there are.
+    #[cfg(any(feature = "tiff", feature = "exr"))]
+    pub fn len(&self) -> usize {
+        match self {
+            Values::Floats(values) => values.len(),
+            Values::Integers(values) => values.len(),
+        }
+    }
+
     /// Puts column by column into row by row.
     pub fn by_rows(self, width: usize, height: usize) -> Self {
         fn turned<T: Copy>(columns: &[T], width: usize, height: usize) -> Vec<T> {

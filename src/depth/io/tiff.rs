@@ -58,11 +58,7 @@ fn read_from(reader: impl BufRead + Seek, bytes: u64, path: &Path) -> Result<Ras
         DecodingResult::F64(v) => Values::Floats(v.into_iter().map(|d| d as f32).collect()),
         _ => return Err(Error::format(path, "64-bit integers", EXPECTED)),
     };
-    let found = match &values {
-        Values::Floats(v) => v.len(),
-        Values::Integers(v) => v.len(),
-    };
-    check_length("TIFF page", found, pixels)?;
+    check_length("TIFF page", values.len(), pixels)?;
     Ok(Raster { width, height, values })
 }
 

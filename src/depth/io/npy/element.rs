@@ -3,26 +3,12 @@
 use half::f16;
 
 use super::super::raster::Values;
-
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Kind {
-    F16,
-    F32,
-    F64,
-    I8,
-    I16,
-    I32,
-    I64,
-    U8,
-    U16,
-    U32,
-    U64,
-}
+use super::super::scalar::Scalar;
 
 /// An element type: kind and byte order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Element {
-    kind: Kind,
+    kind: Scalar,
     big: bool,
 }
 
@@ -35,17 +21,17 @@ impl Element {
             _ => return None,
         };
         let kind = match text.get(1..)? {
-            "f2" => Kind::F16,
-            "f4" => Kind::F32,
-            "f8" => Kind::F64,
-            "i1" => Kind::I8,
-            "i2" => Kind::I16,
-            "i4" => Kind::I32,
-            "i8" => Kind::I64,
-            "u1" => Kind::U8,
-            "u2" => Kind::U16,
-            "u4" => Kind::U32,
-            "u8" => Kind::U64,
+            "f2" => Scalar::F16,
+            "f4" => Scalar::F32,
+            "f8" => Scalar::F64,
+            "i1" => Scalar::I8,
+            "i2" => Scalar::I16,
+            "i4" => Scalar::I32,
+            "i8" => Scalar::I64,
+            "u1" => Scalar::U8,
+            "u2" => Scalar::U16,
+            "u4" => Scalar::U32,
+            "u8" => Scalar::U64,
             _ => return None,
         };
         let element = Self { kind, big };
@@ -55,12 +41,7 @@ impl Element {
 
     /// Bytes of one value.
     pub(super) fn size(self) -> usize {
-        match self.kind {
-            Kind::I8 | Kind::U8 => 1,
-            Kind::F16 | Kind::I16 | Kind::U16 => 2,
-            Kind::F32 | Kind::I32 | Kind::U32 => 4,
-            Kind::F64 | Kind::I64 | Kind::U64 => 8,
-        }
+        self.kind.size()
     }
 
     /// The values of a buffer of whole elements.
@@ -71,17 +52,17 @@ impl Element {
             };
         }
         match self.kind {
-            Kind::F16 => Values::Floats(self.each(data, |b| f16::from_le_bytes(b).to_f32())),
-            Kind::F32 => Values::Floats(self.each(data, f32::from_le_bytes)),
-            Kind::F64 => Values::Floats(self.each(data, |b| f64::from_le_bytes(b) as f32)),
-            Kind::I8 => integers!(i8),
-            Kind::I16 => integers!(i16),
-            Kind::I32 => integers!(i32),
-            Kind::I64 => integers!(i64),
-            Kind::U8 => integers!(u8),
-            Kind::U16 => integers!(u16),
-            Kind::U32 => integers!(u32),
-            Kind::U64 => integers!(u64),
+            Scalar::F16 => Values::Floats(self.each(data, |b| f16::from_le_bytes(b).to_f32())),
+            Scalar::F32 => Values::Floats(self.each(data, f32::from_le_bytes)),
+            Scalar::F64 => Values::Floats(self.each(data, |b| f64::from_le_bytes(b) as f32)),
+            Scalar::I8 => integers!(i8),
+            Scalar::I16 => integers!(i16),
+            Scalar::I32 => integers!(i32),
+            Scalar::I64 => integers!(i64),
+            Scalar::U8 => integers!(u8),
+            Scalar::U16 => integers!(u16),
+            Scalar::U32 => integers!(u32),
+            Scalar::U64 => integers!(u64),
         }
     }
 

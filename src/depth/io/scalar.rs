@@ -1,10 +1,10 @@
-//! Numbers as PLY and PCD files store them.
+//! Numbers as files store them: arrays of NumPy, clouds in PLY and PCD.
 
 use half::f16;
 
 /// Type of a stored number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Scalar {
+pub enum Scalar {
     I8,
     U8,
     I16,
@@ -20,7 +20,7 @@ pub(super) enum Scalar {
 
 impl Scalar {
     /// Bytes of one.
-    pub(super) fn size(self) -> usize {
+    pub fn size(self) -> usize {
         match self {
             Scalar::I8 | Scalar::U8 => 1,
             Scalar::I16 | Scalar::U16 | Scalar::F16 => 2,
@@ -30,7 +30,7 @@ impl Scalar {
     }
 
     /// The number in the first bytes; `None` if there are too few. 64-bit integers are rounded.
-    pub(super) fn read(self, bytes: &[u8], big: bool) -> Option<f64> {
+    pub fn read(self, bytes: &[u8], big: bool) -> Option<f64> {
         fn first<const N: usize>(bytes: &[u8], big: bool) -> Option<[u8; N]> {
             let mut first: [u8; N] = *bytes.first_chunk()?;
             if big {
