@@ -20,9 +20,9 @@ impl Calibration {
     /// included.
     ///
     /// # Errors
-    /// [`Error::Io`]; [`Error::Config`] for a key that is missing or has another form, which it names with what was expected, and
-    /// for a size that is not the picture's; [`Error::Format`] for text of another kind and an unknown ending;
-    /// [`Error::Argument`] for a KITTI file without the number of a camera, and for numbers that no camera or motion has.
+    /// [`crate::Error::Io`]; [`crate::Error::Config`] for a key that is missing or has another form, which it names with what was expected, and
+    /// for a size that is not the picture's; [`crate::Error::Format`] for text of another kind and an unknown ending;
+    /// [`crate::Error::Argument`] for a KITTI file without the number of a camera, and for numbers that no camera or motion has.
     pub fn read(path: impl AsRef<Path>, options: &CalibrationOptions) -> Result<Self> {
         let path = path.as_ref();
         match extension(path).as_str() {

@@ -24,7 +24,7 @@ impl PointCloud {
     /// stay in the frame in which they are stored.
     ///
     /// # Errors
-    /// [`Error::Io`]; [`Error::Format`] for a damaged file, one without x, y, z, one beyond 2 GiB and an unknown ending.
+    /// [`crate::Error::Io`]; [`crate::Error::Format`] for a damaged file, one without x, y, z, one beyond 2 GiB and an unknown ending.
     pub fn read(path: impl AsRef<Path>) -> Result<Self> {
         let path = path.as_ref();
         let decode: fn(&[u8], &Path) -> Result<Self> = match extension(path).as_str() {
@@ -40,7 +40,7 @@ impl PointCloud {
     /// `rgb`, as PCL does) and `confidence`, all numbers as f32.
     ///
     /// # Errors
-    /// [`Error::BufferLength`] for a part without an entry per point, [`Error::Format`] for another ending, [`Error::Io`]; the file is
+    /// [`crate::Error::BufferLength`] for a part without an entry per point, [`crate::Error::Format`] for another ending, [`crate::Error::Io`]; the file is
     /// then as it was before.
     pub fn write(&self, path: impl AsRef<Path>) -> Result<()> {
         let path = path.as_ref();

@@ -27,7 +27,7 @@ pub(crate) use scalar::Scalar;
 /// A depth file of any kind by its name; behind `.npz` may stand `:` and the name of an array.
 ///
 /// # Errors
-/// [`Error::Io`]; [`Error::Format`] for a damaged file, an unknown ending, and one whose feature this build lacks.
+/// [`crate::Error::Io`]; [`crate::Error::Format`] for a damaged file, an unknown ending, and one whose feature this build lacks.
 pub(super) fn read(path: &Path) -> Result<Raster> {
     if let Some((archive, name)) = named_array(path) {
         return npz::read_npz(archive, Some(name));
