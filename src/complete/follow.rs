@@ -4,7 +4,7 @@ use super::alignment::{Alignment, Anchors};
 use super::cells::{Cell, Cells};
 use super::pace::{Clock, Seconds};
 use super::prior::Prior;
-use super::questions::{Answers, Questions, answered};
+use super::questions::{Answers, Questions, answered, scaled};
 use crate::error::Result;
 use crate::query::plan::stride_within;
 use crate::query::told::choose_evenly;
@@ -146,10 +146,13 @@ impl Questions<'_> {
             answered(at, moved.unwrap_or(reading))
         };
         let mut said = HashSet::new();
+        // What is expected was scaled with the last map, answers will be with this one.
+        let unscaled = self.scale().undone();
         for answer in &mut answers.settled {
             said.insert((answer.x, answer.y));
             let cell = cells.get(cells.at((answer.x, answer.y)));
-            let before = expected(answer.y * width + answer.x);
+            let mut before = expected(answer.y * width + answer.x);
+            scaled(&unscaled, &mut before);
             if !cell.forgotten && (answer.depth / before.depth).ln().abs() <= ALIKE {
                 *answer = averaged(answer, &before);
             }

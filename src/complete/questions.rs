@@ -6,7 +6,7 @@ use crate::depth::outliers::Outlier;
 use crate::depth::{DepthMap, SparseDepth, interpolate};
 use crate::error::Result;
 use crate::model::{AskOptions, Prefix, SdimModel, ask};
-use crate::query::{Hint, Query, Reading};
+use crate::query::{ConfidenceScale, Hint, Query, Reading};
 use crate::refine::{Answered, FillInput, Filled, Sampling};
 use image::RgbImage;
 
@@ -65,6 +65,11 @@ impl<'a> Questions<'a> {
             Hint::None => Vec::new(),
         };
         Ok(Self { model, prefix, rgb, sparse, flagged, options, hint })
+    }
+
+    /// What is made of the confidence of answers.
+    pub(super) fn scale(&self) -> &ConfidenceScale {
+        &self.model.prompts.settings().confidence
     }
 
     pub(super) fn size(&self) -> (usize, usize) {
@@ -177,7 +182,9 @@ impl<'a> Questions<'a> {
         known.extend(&answers.settled);
         let fresh = known.len();
         known.extend(&answers.carried);
+        let scale = self.scale();
         let Some(filter) = &self.options.filter else {
+            known[..fresh].iter_mut().for_each(|a| scaled(scale, a));
             return Ok(known);
         };
         let (width, height) = self.size();
@@ -189,6 +196,8 @@ impl<'a> Questions<'a> {
         let pixel = width as f32 / self.prefix.space.resized.0.max(1) as f32;
         let sampling = Sampling { spacing: answers.spacing, pixel };
         let mut read = filter.read(&known[..fresh], &input, interpolated, sampling)?;
+        // What is carried was scaled when it was answered.
+        read.iter_mut().for_each(|a| scaled(scale, a));
         read.extend(&answers.carried);
         Ok(read)
     }
@@ -229,6 +238,11 @@ impl<'a> Questions<'a> {
 pub(super) fn answered((x, y): (usize, usize), reading: Reading) -> Answered {
     let Reading { value: depth, confidence, expected_error } = reading;
     Answered { x, y, depth, confidence, expected_error }
+}
+
+/// Makes an answer's confidence the one that held-out scenes bear out.
+pub(super) fn scaled(scale: &ConfidenceScale, answer: &mut Answered) {
+    answer.confidence = scale.confidence(answer.confidence);
 }
 
 /// What a map has at flagged measurements.

@@ -39,20 +39,41 @@ pub fn sparsification(errors: &[f64], uncertainty: &[f64]) -> Option<Sparsificat
     Some(Sparsification { ause: area - oracle, aurg: 1.0 - area })
 }
 
+/// The curve whose area [`sparsification`] judges: `(share, S)` at `steps + 1` shares of pixels removed, from 0 on and evenly apart, the most
+/// uncertain first. The last share leaves at least one pixel. `S` is the mean error of the pixels left, in units of that of all.
+///
+/// `None` as [`sparsification`], for 0 steps, and with no error at all.
+pub fn sparsification_curve(errors: &[f64], uncertainty: &[f64], steps: usize) -> Option<Vec<(f64, f64)>> {
+    sparsification(errors, uncertainty).filter(|_| steps > 0)?;
+    let mut pairs: Vec<(f64, f64)> = uncertainty.iter().copied().zip(errors.iter().copied()).collect();
+    let means = kept_means(&mut pairs);
+    let (n, all) = (means.len(), means.last().copied().filter(|mean| *mean > 0.0)?);
+    let point = |step: usize| {
+        let removed = (n * step / steps).min(n - 1);
+        (removed as f64 / n as f64, means[n - 1 - removed] / all)
+    };
+    Some((0..=steps).map(point).collect())
+}
+
 /// Mean over m = 1 .. n of the mean error of the m surest of (uncertainty, error).
 fn area(pairs: &mut [(f64, f64)]) -> f64 {
+    let means = kept_means(pairs);
+    means.iter().sum::<f64>() / means.len() as f64
+}
+
+/// The mean error of the m surest of (uncertainty, error), m = 1 .. n.
+fn kept_means(pairs: &mut [(f64, f64)]) -> Vec<f64> {
     // By error as well, so that sums do not depend on the order given.
     pairs.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.total_cmp(&b.1)));
-    let (mut kept, mut sum, mut area) = (0usize, 0.0, 0.0);
+    let (mut means, mut sum) = (Vec::with_capacity(pairs.len()), 0.0);
     for tied in pairs.chunk_by(|a, b| a.0 == b.0) {
         let mean = tied.iter().map(|p| p.1).sum::<f64>() / tied.len() as f64;
         for _ in tied {
-            kept += 1;
             sum += mean;
-            area += sum / kept as f64;
+            means.push(sum / (means.len() + 1) as f64);
         }
     }
-    area / pairs.len() as f64
+    means
 }
 
 /// What was stated and what came true, for a group of pixels with similar statements.
@@ -178,6 +199,12 @@ mod tests {
         assert_eq!((worst.ause, worst.aurg), (0.5, -0.25));
         let blind = sparsification(&errors, &[1.0; 3]).unwrap();
         assert_eq!((blind.ause, blind.aurg), (0.25, 0.0));
+        assert_eq!(
+            sparsification_curve(&errors, &[0.2, 0.1, 0.3], 3).unwrap(),
+            [(0.0, 1.0), (1.0 / 3.0, 0.75), (2.0 / 3.0, 0.5), (2.0 / 3.0, 0.5)]
+        );
+        assert_eq!(sparsification_curve(&errors, &[0.1; 3], 0), None);
+        assert_eq!(sparsification_curve(&[0.0; 2], &[0.1; 2], 5), None);
         assert_eq!(sparsification(&[0.0; 2], &[1.0, 2.0]), Some(Sparsification { ause: 0.0, aurg: 0.0 }));
     }
 

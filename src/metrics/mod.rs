@@ -11,7 +11,7 @@ mod structure;
 pub use bootstrap::{Interval, bootstrap_mean, bootstrap_ratio};
 pub use confidence::{
     Calibration, CalibrationBin, ConfidenceScores, Sparsification, calibration, score_confidence,
-    sparsification,
+    sparsification, sparsification_curve,
 };
 pub use relative::RelativeError;
 pub use structure::{DISTANCE_LIMITS, EdgeRule, Regions, gradient_error};

@@ -3,6 +3,7 @@
 //! Nothing here holds weights: a loaded checkpoint asks in `model`.
 
 pub mod bins;
+pub mod confidence;
 pub mod grammar;
 pub mod marker;
 pub mod mode;
@@ -15,6 +16,7 @@ pub mod template;
 pub mod told;
 mod unit;
 
+pub use confidence::ConfidenceScale;
 pub use grammar::{AnswerGrammar, parse_depth};
 pub use marker::{Marker, MarkerShape};
 pub use mode::{AnswerMode, Generation};

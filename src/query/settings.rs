@@ -1,5 +1,6 @@
 //! `sdim.json`: what is ours about a checkpoint, beside the published `config.json`.
 
+use super::confidence::ConfidenceScale;
 use super::marker::Marker;
 use super::mode::{AnswerMode, Generation};
 use super::number::{DepthUnit, NumberFormat, NumberTokens};
@@ -89,6 +90,9 @@ pub struct Settings {
     /// How an answer is got.
     #[serde(default)]
     pub answer_mode: AnswerMode,
+    /// What is made of the confidence of answers.
+    #[serde(default, skip_serializing_if = "ConfidenceScale::is_identity")]
+    pub confidence: ConfidenceScale,
     /// Channels of the fusion block; `null` for a checkpoint without one.
     #[serde(default)]
     pub fusion: Option<FusionConfig>,
@@ -129,6 +133,7 @@ impl Settings {
             number_tokens: NumberTokens::Vocabulary,
             unit: DepthUnit::Metres,
             answer_mode: AnswerMode::Digits,
+            confidence: ConfidenceScale::default(),
             fusion: None,
             lora: None,
         }
@@ -180,6 +185,7 @@ impl Settings {
             number_tokens: NumberTokens::Vocabulary,
             unit: DepthUnit::FrameMedian,
             answer_mode: AnswerMode::Digits,
+            confidence: ConfidenceScale::default(),
             fusion: Some(FusionConfig { branch: 16, high: 32, low: 16 }),
             lora: None,
         }
@@ -217,6 +223,11 @@ impl Settings {
         .map_err(wrong)?;
         settings.validate(&name)?;
         Ok(settings)
+    }
+
+    /// The same without what was found for one set of weights and says nothing of others: the scale of the confidence.
+    pub fn of_the_shape(&self) -> Self {
+        Self { confidence: ConfidenceScale::default(), ..self.clone() }
     }
 
     /// Reads `sdim.json`.
@@ -268,6 +279,7 @@ impl Settings {
         if let Some(lora) = &self.lora {
             lora.validate(file)?;
         }
+        self.confidence.validate(file)?;
         self.template.validate(file)?;
         self.number.validate(file)?;
         self.number_tokens.validate(file, self.number)?;

@@ -133,7 +133,7 @@ impl RecordConfig {
             index,
             config: serde_json::to_value(self)
                 .map_err(|e| Error::format("records", e.to_string(), "a configuration that JSON can hold"))?,
-            settings: asking.prompts.settings().clone(),
+            settings: asking.prompts.settings().of_the_shape(),
         };
         let dims = Dims {
             frames: made.len(),

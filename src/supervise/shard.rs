@@ -311,7 +311,7 @@ impl Shard {
                 format!("{} frames, {} variants", d.frames, d.variants),
             ));
         }
-        if *asking.prompts.settings() != self.about.settings {
+        if asking.prompts.settings().of_the_shape() != self.about.settings {
             return Err(Error::argument("sdim.json", "another one", "that of the records"));
         }
         let at = frame * d.variants + variant;

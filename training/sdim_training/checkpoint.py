@@ -1,5 +1,6 @@
 """Checkpoints: the published one, which the crate loads as it is, and the state that a run resumes from."""
 
+import json
 import os
 import shutil
 from pathlib import Path
@@ -28,11 +29,15 @@ def load_weights(model, directory):
 
 
 def publish(model, files, directory):
-    """A checkpoint directory of these weights in bf16, with the JSON files of the directory `files`."""
+    """A checkpoint directory of these weights in bf16, with the JSON files of the directory `files`, but for the scale of the confidence:
+    it was found for other weights (example `confidence`)."""
     directory.mkdir(parents=True, exist_ok=True)
     for name in FILES:
         if not (directory / name).exists() or not os.path.samefile(Path(files) / name, directory / name):
             whole(directory / name, lambda part, name=name: shutil.copyfile(Path(files) / name, part))
+    sdim = json.loads((directory / "sdim.json").read_text())
+    if sdim.pop("confidence", None):
+        whole(directory / "sdim.json", lambda part: part.write_text(json.dumps(sdim, indent=2) + "\n"))
     tensors = {k: v.detach().bfloat16().contiguous().cpu() for k, v in model.state_dict().items()}
     whole(directory / WEIGHTS, lambda part: save_file(tensors, part))
 

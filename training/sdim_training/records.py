@@ -23,7 +23,8 @@ class Shard:
             about = json.loads((file.metadata() or {}).get("sdim_records", "{}"))
             if about.get("version") != VERSION:
                 raise ValueError(f"{path}: not records of version {VERSION}")
-            if about["settings"] != settings:
+            # The scale of the confidence was found for one set of weights; records know nothing of it.
+            if about["settings"] != {k: v for k, v in settings.items() if k != "confidence"}:
                 raise ValueError(f"{path}: its settings are not those of the checkpoint's sdim.json")
             tensors = {name: file.get_tensor(name) for name in file.keys()}
         self.config = about["config"]

@@ -1,6 +1,7 @@
 """Training on the fixture's records: it learns, resumes bit for bit, survives bad numbers, and publishes what was averaged."""
 
 import csv
+import json
 import shutil
 from types import SimpleNamespace
 
@@ -111,3 +112,15 @@ def test_other_records_are_refused(tmp_path):
     trainer, _, _ = trainer_and_batch(tmp_path)
     with pytest.raises(ValueError, match="settings are not those"):
         Pool(tmp_path / "records", trainer.config.sdim | {"glimpse": 8}).refresh()
+
+
+def test_a_scale_of_the_confidence_stays_with_its_weights(tmp_path):
+    trainer, pool, _ = trainer_and_batch(tmp_path)
+    scaled = trainer.config.sdim | {"confidence": {"temperature": 0.8, "offset": 0.2}}
+    Pool(tmp_path / "records", scaled).refresh()
+    files = tmp_path / "scaled"
+    shutil.copytree(FIXTURE / "checkpoint", files)
+    (files / "sdim.json").write_text(json.dumps(scaled))
+    checkpoint.publish(trainer.model, files, tmp_path / "published")
+    assert json.loads((tmp_path / "published/sdim.json").read_text()) == trainer.config.sdim
+    assert "confidence" in json.loads((files / "sdim.json").read_text())
