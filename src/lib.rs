@@ -183,8 +183,10 @@ pub mod internals {
     pub mod supervise {
         pub use crate::supervise::batch::*;
         pub use crate::supervise::init::*;
+        pub use crate::supervise::known::*;
         pub use crate::supervise::loss::*;
         pub use crate::supervise::mix::*;
+        pub use crate::supervise::prompts::*;
         pub use crate::supervise::recipe::*;
         pub use crate::supervise::records::*;
         pub use crate::supervise::shape::*;

@@ -59,7 +59,7 @@ use std::str::FromStr;
 /// differ from run to run).
 #[derive(Parser)]
 pub struct Args {
-    /// How the data set is stored: folder, nyu, void, ibims, kitti, ddad, tum or scannet.
+    /// How the data set is stored: folder, nyu, void, ibims, kitti, ddad, tum, scannet, hypersim or virtual-kitti.
     #[arg(long, default_value = "folder")]
     layout: Layout,
     /// The data set.

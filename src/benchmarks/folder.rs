@@ -1,5 +1,6 @@
 //! Folders of RGB-D frames: `rgb/NAME.png` or `.jpg`, `gt/NAME.png` or `.npy`, and perhaps `sparse/NAME.png` or `.npy`; or the
-//! same side by side as `NAME_rgb`, `NAME_gt` and `NAME_sparse`.
+//! same side by side as `NAME_rgb`, `NAME_gt` and `NAME_sparse`. A folder with `rgb` and `sparse` and without `gt` is what a robot records:
+//! its frames have measurements and no ground truth.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -21,7 +22,7 @@ const DEPTHS: [&str; 2] = ["png", "npy"];
 #[derive(Clone, Debug)]
 pub(super) struct Files {
     rgb: PathBuf,
-    gt: PathBuf,
+    gt: Option<PathBuf>,
     sparse: Option<PathBuf>,
     scale: Option<DepthScale>,
 }
@@ -36,6 +37,8 @@ impl FolderDataset {
     /// Lists `dir`. `scale` is the unit of its 16-bit PNGs and integer npy files; without one, that of `manifest.json` counts
     /// where frames lie side by side, and else loading such a file fails.
     ///
+    /// Where `gt` is absent and `sparse` is not, the ground truth of all frames is NaN.
+    ///
     /// Fails with [`Error::Io`] when `rgb` or `gt` cannot be listed, and with [`Error::Format`] naming the file when a
     /// picture has no ground truth, a ground truth or measurement no picture, or there is no frame at all. Other folders
     /// (`intrinsics/`) are left alone.
@@ -47,11 +50,27 @@ impl FolderDataset {
             return Self::pair(pictures, truths, measured, at, |name| scale.or(scales.get(name).copied()));
         }
         let pictures = list_some(&dir.join("rgb"), &PICTURES)?;
-        let truths = list(&dir.join("gt"), &DEPTHS)?;
-        let sparse_dir = dir.join("sparse");
-        let measured = if sparse_dir.is_dir() { list(&sparse_dir, &DEPTHS)? } else { Vec::new() };
+        let (gt_dir, sparse_dir) = (dir.join("gt"), dir.join("sparse"));
+        let mut measured = if sparse_dir.is_dir() { list(&sparse_dir, &DEPTHS)? } else { Vec::new() };
+        if !gt_dir.exists() && !measured.is_empty() {
+            return Self::measured_alone(pictures, &mut measured, scale);
+        }
+        let truths = list(&gt_dir, &DEPTHS)?;
         let at = |name: &str, part: &str| format!("{part}/{name}.png");
         Self::pair(pictures, truths, measured, at, |_| scale)
+    }
+
+    /// Frames without ground truth, each with its measurements.
+    fn measured_alone(pictures: Listed, measured: &mut Listed, scale: Option<DepthScale>) -> Result<Self> {
+        let mut frames = Vec::with_capacity(pictures.len());
+        for (name, rgb) in pictures {
+            let sparse = take(measured, &name);
+            let lacks = || unpaired(&rgb, "measurements", format!("sparse/{name}.png or .npy"));
+            let files = Files { sparse: Some(sparse.ok_or_else(lacks)?), rgb, gt: None, scale };
+            frames.push(Frame { name, files });
+        }
+        all_taken(std::mem::take(measured), |name| format!("rgb/{name}.png or .jpg"))?;
+        Ok(Self { frames })
     }
 
     fn pair(
@@ -67,7 +86,7 @@ impl FolderDataset {
                 return Err(unpaired(&rgb, "ground truth", format!("{} or .npy", at(&name, "gt"))));
             };
             let (sparse, scale) = (take(&mut measured, &name), scale(&name));
-            frames.push(Frame { name, files: Files { rgb, gt, sparse, scale } });
+            frames.push(Frame { name, files: Files { rgb, gt: Some(gt), sparse, scale } });
         }
         truths.append(&mut measured);
         all_taken(truths, |name| format!("{} or .jpg", at(name, "rgb")))?;
@@ -89,7 +108,10 @@ impl Loader for FolderDataset {
     fn read(&self, frame: &Frame<Files>, _: usize) -> Result<Sample> {
         let Files { rgb, gt, sparse, scale } = &frame.files;
         let rgb = picture(rgb)?;
-        let gt = depth(gt, *scale, &rgb)?.as_slice().to_vec();
+        let gt = match gt {
+            Some(path) => depth(path, *scale, &rgb)?.as_slice().to_vec(),
+            None => vec![f32::NAN; rgb.width() as usize * rgb.height() as usize],
+        };
         let sparse = sparse.as_ref().map(|path| depth(path, *scale, &rgb)).transpose()?;
         Ok(Sample { name: frame.name.clone(), rgb, gt, sparse, masks: Vec::new() })
     }
@@ -184,6 +206,22 @@ mod tests {
             write_frame(dir.path(), "../x", &frame, DepthFile::Npy),
             Err(Error::Argument { .. })
         ));
+    }
+
+    #[test]
+    fn a_robots_own_frames_have_no_ground_truth() {
+        let dir = tempfile::tempdir().unwrap();
+        let frame = procedural(6, 16, 12).unwrap();
+        write_frame(dir.path(), "one", &frame, DepthFile::Npy).unwrap();
+        fs::rename(dir.path().join("gt"), dir.path().join("sparse")).unwrap();
+        let set = FolderDataset::open(dir.path(), None).unwrap();
+        let sample = set.load(0).unwrap();
+        assert!(set.has_measurements(0) && sample.gt.iter().all(|d| d.is_nan()) && sample.gt.len() == 192);
+        let known = frame.depth.iter().filter(|d| d.is_finite()).count();
+        assert_eq!(sample.sparse.unwrap().measured(), known);
+        frame.rgb.save(dir.path().join("rgb/two.png")).unwrap();
+        let error = FolderDataset::open(dir.path(), None).unwrap_err().to_string();
+        assert!(error.contains("two.png") && error.contains("sparse/two"), "{error}");
     }
 
     #[test]

@@ -2,8 +2,11 @@
 
 use std::path::{Path, PathBuf};
 
+use half::f16;
 use hdf5_reader::error::Error as Hdf5Error;
-use hdf5_reader::{Datatype, FilterRegistry, Hdf5File, OpenOptions, SliceInfo, SliceInfoElem};
+use hdf5_reader::{
+    ByteOrder, Datatype, FilterRegistry, H5Type, Hdf5File, OpenOptions, SliceInfo, SliceInfoElem,
+};
 
 use crate::depth::io::lzf;
 use crate::error::{Error, Result};
@@ -55,11 +58,14 @@ impl Numbers {
         Ok(values.map_err(|e| self.wrong(name, e.to_string()))?.iter().copied().collect())
     }
 
-    /// Floating-point values (f32 or f64), of the whole data set or of one index of its first axis.
+    /// Floating-point values (f16, f32 or f64), of the whole data set or of one index of its first axis.
     pub(super) fn floats(&self, name: &str, index: Option<usize>) -> Result<Vec<f32>> {
         let data = self.file.dataset(name).map_err(|e| self.wrong(name, e.to_string()))?;
         let selection = selection(data.ndim(), index);
         let values = match data.dtype() {
+            Datatype::FloatingPoint { size: 2, .. } => {
+                data.read_slice::<Half>(&selection).map(|a| a.iter().map(|v| v.0).collect())
+            }
             Datatype::FloatingPoint { size: 4, .. } => {
                 data.read_slice::<f32>(&selection).map(|a| a.iter().copied().collect())
             }
@@ -76,8 +82,36 @@ impl Numbers {
         Error::format(
             &self.path,
             format!("data set `{name}`: {found}"),
-            "8-bit `rgb` or `img`, floating-point depth",
+            "8-bit pictures, floating-point depth",
         )
+    }
+}
+
+/// A number that is stored in 16 bits, for which the reader has no type.
+#[derive(Clone, Copy)]
+struct Half(f32);
+
+impl H5Type for Half {
+    fn hdf5_type() -> Datatype {
+        Datatype::FloatingPoint { size: 2, byte_order: ByteOrder::LittleEndian }
+    }
+
+    fn from_bytes(bytes: &[u8], dtype: &Datatype) -> hdf5_reader::error::Result<Self> {
+        match (dtype, bytes) {
+            (Datatype::FloatingPoint { size: 2, byte_order }, &[a, b]) => {
+                let big = *byte_order == ByteOrder::BigEndian;
+                let value = if big { f16::from_be_bytes([a, b]) } else { f16::from_le_bytes([a, b]) };
+                Ok(Self(value.to_f32()))
+            }
+            _ => {
+                let actual = format!("{dtype:?}");
+                Err(Hdf5Error::TypeMismatch { expected: "a number of 16 bits".into(), actual })
+            }
+        }
+    }
+
+    fn element_size(_: &Datatype) -> usize {
+        2
     }
 }
 

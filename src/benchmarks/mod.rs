@@ -14,6 +14,7 @@ mod files;
 mod flat;
 pub(crate) mod folder;
 mod hdf5;
+mod hypersim;
 mod ibims;
 mod kitti;
 mod listing;
@@ -23,6 +24,7 @@ pub(crate) mod outliers;
 mod parts;
 mod scannet;
 mod tum;
+mod virtual_kitti;
 mod void;
 
 use std::path::{Path, PathBuf};
@@ -33,19 +35,21 @@ use crate::error::{Error, Result};
 pub use dataset::{Dataset, Mask, Sample, frame_seed};
 use ddad::DdadDataset;
 use folder::FolderDataset;
+use hypersim::HypersimDataset;
 use ibims::IbimsDataset;
 use kitti::KittiDataset;
 use nyu::NyuDataset;
 use parts::{Chosen, Ranged};
 use scannet::ScanNetDataset;
 use tum::TumDataset;
+use virtual_kitti::VirtualKittiDataset;
 use void::VoidDataset;
 
 /// The way in which a data set is stored. Parses from its name in lower case.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Layout {
-    /// `folder`: `rgb/`, `gt/` and perhaps `sparse/`, as Marigold-DC's scripts write them.
+    /// `folder`: `rgb/`, `gt/` and perhaps `sparse/`, as Marigold-DC's scripts write them; `rgb/` and `sparse/` alone have no ground truth.
     Folder,
     /// `nyu`: NYU Depth V2 in HDF5.
     Nyu,
@@ -61,6 +65,10 @@ pub enum Layout {
     Tum,
     /// `scannet`: exported ScanNet scenes.
     ScanNet,
+    /// `hypersim`: rendered rooms of Hypersim, for training.
+    Hypersim,
+    /// `virtual-kitti`: rendered streets of Virtual KITTI 2, for training.
+    VirtualKitti,
 }
 
 /// What may be chosen when a data set is opened.
@@ -109,7 +117,7 @@ impl LayoutOptions {
 
 impl Layout {
     /// Every layout.
-    pub const ALL: [Layout; 8] = [
+    pub const ALL: [Layout; 10] = [
         Layout::Folder,
         Layout::Nyu,
         Layout::Void,
@@ -118,6 +126,8 @@ impl Layout {
         Layout::Ddad,
         Layout::Tum,
         Layout::ScanNet,
+        Layout::Hypersim,
+        Layout::VirtualKitti,
     ];
 
     /// The name that [`Layout::from_str`] reads.
@@ -131,6 +141,8 @@ impl Layout {
             Layout::Ddad => "ddad",
             Layout::Tum => "tum",
             Layout::ScanNet => "scannet",
+            Layout::Hypersim => "hypersim",
+            Layout::VirtualKitti => "virtual-kitti",
         }
     }
 
@@ -141,6 +153,7 @@ impl Layout {
             Layout::Nyu | Layout::ScanNet => Some(500),
             Layout::Ibims => Some(1000),
             Layout::Folder | Layout::Void | Layout::Kitti | Layout::Ddad | Layout::Tum => None,
+            Layout::Hypersim | Layout::VirtualKitti => None,
         }
     }
 
@@ -154,7 +167,7 @@ impl Layout {
             Layout::Kitti => Some(1000),
             Layout::Ddad => Some(3950),
             Layout::ScanNet => Some(745),
-            Layout::Folder | Layout::Tum => None,
+            Layout::Folder | Layout::Tum | Layout::Hypersim | Layout::VirtualKitti => None,
         }
     }
 
@@ -179,6 +192,8 @@ impl Layout {
             Layout::Ddad => Box::new(DdadDataset::open(path, options.seed)?),
             Layout::Tum => Box::new(TumDataset::open(path)?),
             Layout::ScanNet => Box::new(ScanNetDataset::open(path)?),
+            Layout::Hypersim => Box::new(HypersimDataset::open(path)?),
+            Layout::VirtualKitti => Box::new(VirtualKittiDataset::open(path)?),
         };
         if let Some(list) = &options.frames {
             frames = Box::new(Chosen::by_list(frames, list)?);

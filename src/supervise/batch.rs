@@ -177,6 +177,19 @@ pub fn told_and_asked(
     rng: &mut ChaCha8Rng,
 ) -> Result<(SparseDepth, Asked)> {
     let measured = measure(frame, config, picture, rng)?;
+    asked_about(frame, measured, config, rng)
+}
+
+/// Of what was measured in a frame: what is told, and what is asked.
+///
+/// # Errors
+/// [`crate::Error::NoMeasurement`] if nothing is left to tell.
+pub(super) fn asked_about(
+    frame: &RgbdFrame,
+    measured: SparseDepth,
+    config: &BatchConfig,
+    rng: &mut ChaCha8Rng,
+) -> Result<(SparseDepth, Asked)> {
     let (mut told, held_back) = match config.labels {
         LabelSource::Dense => (measured, None),
         LabelSource::Sparse => split(&measured, rng)?,

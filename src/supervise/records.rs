@@ -44,12 +44,11 @@ pub struct RecordConfig {
 }
 
 impl RecordConfig {
-    /// Checks the sizes, and that the checkpoint asks as records can hold it: one token at a pixel with a hint, one token as
-    /// the answer, measurements in the prefix.
+    /// Checks the sizes.
     ///
     /// # Errors
-    /// [`Error::Argument`] on a size, [`Error::Config`] on a way of asking.
-    pub fn check(&self, asking: Asking) -> Result<()> {
+    /// [`Error::Argument`].
+    pub(super) fn check_sizes(&self, asking: Asking) -> Result<()> {
         let b = &self.batch;
         let side = asking.config.vision.patch_size * asking.config.vision.merge_size;
         for (name, value, most) in [
@@ -82,6 +81,16 @@ impl RecordConfig {
         if let RecordSet::HeldOut { points: 0, .. } | RecordSet::HeldOut { grid: Some(0), .. } = self.set {
             return Err(Error::argument("held-out set", format!("{:?}", self.set), "at least 1 of each"));
         }
+        Ok(())
+    }
+
+    /// Checks the sizes, and that the checkpoint asks as records can hold it: one token at a pixel with a hint, one token as
+    /// the answer, measurements in the prefix.
+    ///
+    /// # Errors
+    /// [`Error::Argument`] on a size, [`Error::Config`] on a way of asking.
+    pub fn check(&self, asking: Asking) -> Result<()> {
+        self.check_sizes(asking)?;
         let s = asking.prompts.settings();
         // What a record calls a number: its token, or its row.
         let (key, ids) = match s.number_tokens {

@@ -23,17 +23,16 @@
 //! The file's metadata holds [`About`] as JSON under `sdim_records`.
 
 use super::batch::{Asking, Example, Item};
+use super::tensor_file::{Reader, bytes, write};
 use crate::depth::SparseDepth;
 use crate::error::{Error, Result};
-use crate::files::write_whole;
 use crate::query::prompt::{FrameSpace, MEASURED_TIME, QUERY_TIME, Tokens};
 use crate::query::{NumberTokens, Settings};
 use crate::vlm::qwen2_5::grid::Grid;
 use crate::vlm::qwen2_5::preprocess::Pixels;
 use crate::vlm::qwen2_5::token_table::FIRST_ADDED;
 use image::RgbImage;
-use safetensors::tensor::{Dtype, SafeTensors, TensorView};
-use std::collections::HashMap;
+use safetensors::tensor::Dtype;
 use std::path::Path;
 
 /// The version of the format that this crate writes and reads.
@@ -210,15 +209,7 @@ impl Shard {
             ("asked_hint", Dtype::F32, &asked, f32s(&self.asked_hint)),
             ("asked_value", Dtype::F32, &asked, f32s(&self.asked_value)),
         ];
-        let wrong = |e: String| Error::format(path, e, "records that safetensors can hold");
-        let views = parts.iter().map(|(name, dtype, shape, data)| {
-            Ok((*name, TensorView::new(*dtype, shape.to_vec(), data).map_err(|e| wrong(e.to_string()))?))
-        });
-        let views = views.collect::<Result<Vec<_>>>()?;
-        let about = serde_json::to_string(&self.about).map_err(|e| wrong(e.to_string()))?;
-        let metadata = HashMap::from([(KEY.to_string(), about)]);
-        let file = safetensors::serialize(views, Some(metadata)).map_err(|e| wrong(e.to_string()))?;
-        write_whole(path, &file)
+        write(path, KEY, &self.about, &parts)
     }
 
     /// Reads a shard.
@@ -228,16 +219,7 @@ impl Shard {
     /// has another type or shape, or an entry is out of range.
     pub fn read(path: &Path) -> Result<Self> {
         let file = std::fs::read(path).map_err(Error::io(path))?;
-        let wrong = |found: String| Error::format(path, found, format!("records of version {VERSION}"));
-        let (_, header) = SafeTensors::read_metadata(&file).map_err(|e| wrong(e.to_string()))?;
-        let about = header.metadata().as_ref().and_then(|m| m.get(KEY));
-        let about = about.ok_or_else(|| wrong(format!("no {KEY} in the metadata")))?;
-        let about: About = serde_json::from_str(about).map_err(|e| wrong(e.to_string()))?;
-        if about.version != VERSION {
-            return Err(wrong(format!("version {}", about.version)));
-        }
-        let tensors = SafeTensors::deserialize(&file).map_err(|e| wrong(e.to_string()))?;
-        let reader = Reader { path, tensors };
+        let (about, reader) = Reader::open(path, &file, KEY, "records", VERSION)?;
         let [n, height, width, _] = reader.shape("rgb")?;
         let [_, variants, told] = reader.shape("told_id")?;
         let [_, _, asked] = reader.shape("asked_id")?;
@@ -277,10 +259,7 @@ impl Shard {
         let check = |ok: bool, name: &str, expected: &str| {
             if ok { Ok(()) } else { Err(reader.wrong(name, "an entry out of range", expected)) }
         };
-        let starts = &self.measured_start;
-        let ends = (starts.first(), starts.last().map(|&s| s as usize));
-        let rising = starts.is_sorted() && ends == (Some(&0), Some(self.measured_pixel.len()));
-        check(rising, "measured_start", "rising from 0 to the number of measurements")?;
+        reader.check_starts("measured_start", &self.measured_start, self.measured_pixel.len())?;
         let pixels = d.width * d.height;
         let inside = self.measured_pixel.iter().all(|&p| (p as usize) < pixels);
         check(inside, "measured_pixel", "pixels of the frame")?;
@@ -354,47 +333,5 @@ impl Shard {
         let answer = asking.prompts.numbers().write(value);
         let (hint, scale) = (self.asked_hint[i], self.scale[at]);
         Item { tokens, supervised: 1, answer, value, hint, scale }
-    }
-}
-
-fn bytes<T: Copy, const N: usize>(values: &[T], to: fn(T) -> [u8; N]) -> Vec<u8> {
-    values.iter().flat_map(|&v| to(v)).collect()
-}
-
-struct Reader<'a> {
-    path: &'a Path,
-    tensors: SafeTensors<'a>,
-}
-
-impl Reader<'_> {
-    fn wrong(&self, name: &str, found: impl ToString, expected: impl ToString) -> Error {
-        let (found, expected) = (found.to_string(), expected.to_string());
-        Error::Tensor { file: self.path.display().to_string(), name: name.into(), found, expected }
-    }
-
-    fn tensor(&self, name: &str) -> Result<TensorView<'_>> {
-        self.tensors.tensor(name).map_err(|_| self.wrong(name, "missing", "a tensor of records"))
-    }
-
-    fn shape<const N: usize>(&self, name: &str) -> Result<[usize; N]> {
-        let tensor = self.tensor(name)?;
-        let found = tensor.shape();
-        found.try_into().map_err(|_| self.wrong(name, format!("{found:?}"), format!("{N} dimensions")))
-    }
-
-    fn take<T, const N: usize>(
-        &self,
-        name: &str,
-        dtype: Dtype,
-        shape: &[usize],
-        from: fn([u8; N]) -> T,
-    ) -> Result<Vec<T>> {
-        let tensor = self.tensor(name)?;
-        if tensor.dtype() != dtype || tensor.shape() != shape {
-            let found = format!("{:?} {:?}", tensor.dtype(), tensor.shape());
-            return Err(self.wrong(name, found, format!("{dtype:?} {shape:?}")));
-        }
-        let chunks = tensor.data().chunks_exact(N);
-        Ok(chunks.filter_map(|c| c.try_into().ok()).map(from).collect())
     }
 }

@@ -7,6 +7,7 @@ mod containers;
 mod general;
 mod pictures;
 mod recordings;
+mod rendered;
 
 use std::fs;
 use std::path::Path;

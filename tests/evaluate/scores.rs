@@ -190,6 +190,8 @@ fn every_layout_is_scored() {
         ("ibims", fixture("ibims"), 2, None),
         ("tum", at("tum"), 2, None),
         ("scannet", at("scannet"), 3, None),
+        ("hypersim", fixture("hypersim/ai_002_003"), 1, None),
+        ("virtual-kitti", fixture("virtual_kitti"), 3, None),
     ];
     let scored: Vec<&str> = cases.iter().map(|case| case.0).collect();
     for layout in Layout::ALL {
@@ -238,7 +240,7 @@ fn the_help_names_every_layout() {
     let out = succeeded(Command::new(program("evaluate")).arg("--help").output().unwrap());
     let help = String::from_utf8(out.stdout).unwrap();
     let stored = help.split("How the data set is stored: ").nth(1).unwrap().lines().next().unwrap();
-    let named: Vec<&str> = stored.split(|c: char| !c.is_alphanumeric()).collect();
+    let named: Vec<&str> = stored.split(|c: char| !c.is_alphanumeric() && c != '-').collect();
     for layout in Layout::ALL {
         assert!(named.contains(&layout.name()), "{layout} in {stored}");
     }

@@ -9,7 +9,7 @@ def blur(progress):
     return 0.0015 * widen, 0.008 * widen
 
 
-def bin_loss(logits, batch, config, blur, slope, l1_weight):
+def bin_loss(logits, batch, config, blur, slope, l1_weight, entropy_weight=1.0):
     """Cross-entropy with a blurred target plus L1 on the expected number, counted in the frame's scale; mean over questions.
     Returns the loss and the L1."""
     middles, scale = config.middles(logits.device), batch.scale[:, None, None]
@@ -23,7 +23,7 @@ def bin_loss(logits, batch, config, blur, slope, l1_weight):
     cross_entropy = -(blurred * log_p).sum(-1).mean()
     expected = (log_p.exp() * config.number(middles)).sum(-1, keepdim=True)
     l1 = ((expected - target).abs() / scale).mean()
-    return cross_entropy + l1_weight * l1, l1.detach()
+    return entropy_weight * cross_entropy + l1_weight * l1, l1.detach()
 
 
 def median(logits, config):

@@ -33,7 +33,30 @@ class Batch(NamedTuple):
     scale: Tensor  # f32 [b]: what errors are counted in
 
 
-class Config:
+class Bins:
+    """Where numbers lie, from `number` of sdim.json: bin k covers positions k to k + 1 (`src/query/bins.rs`)."""
+
+    def __init__(self, number):
+        self.bins, self.ratio = number["bins"], number["kind"] == "log_bins"
+        self.lowest = number["lowest"] if self.ratio else 0.0
+        # Of a bin: in number units, or of the number's logarithm.
+        self.width = (math.log(number["highest"] / self.lowest) if self.ratio else number["range"]) / self.bins
+
+    def number(self, position):
+        """The number at a position among the bins."""
+        return self.lowest * (position * self.width).exp() if self.ratio else position * self.width
+
+    def position(self, number):
+        """The position of a number, those out of range at the ends."""
+        position = (number.clamp(min=1e-30) / self.lowest).log() if self.ratio else number
+        return (position / self.width).clamp(0, self.bins)
+
+    def middles(self, device=None):
+        """Positions of the middle of each bin."""
+        return torch.arange(self.bins, device=device) + 0.5
+
+
+class Config(Bins):
     """Sizes and ways of asking, from the JSON files of a checkpoint directory."""
 
     def __init__(self, directory):
@@ -56,11 +79,8 @@ class Config:
             if not fits:
                 raise ValueError(f"{directory}: {key} is not the way of asking that can be trained here")
         self.fusion = (fusion["branch"], fusion["high"], fusion["low"])
-        self.bins, self.glimpse = number["bins"], self.sdim["glimpse"]
-        self.ratio = number["kind"] == "log_bins"
-        self.lowest = number["lowest"] if self.ratio else 0.0
-        # Of a bin: in number units, or of the number's logarithm.
-        self.width = (math.log(number["highest"] / self.lowest) if self.ratio else number["range"]) / self.bins
+        super().__init__(number)
+        self.glimpse = self.sdim["glimpse"]
         self.scale = self.sdim["position_scale"]
         self.mean, self.std = image["image_mean"], image["image_std"]
         added = {t["content"]: t["id"] for t in read("tokenizer.json")["added_tokens"]}
@@ -69,19 +89,6 @@ class Config:
         self.first_number = added["<|d0|>"]
         if added[f"<|d{self.bins - 1}|>"] != self.first_number + self.bins - 1:
             raise ValueError(f"{directory}: number tokens do not follow each other")
-
-    def number(self, position):
-        """The number at a position among the bins; bin k covers k to k + 1 (`src/query/bins.rs`)."""
-        return self.lowest * (position * self.width).exp() if self.ratio else position * self.width
-
-    def position(self, number):
-        """The position of a number, those out of range at the ends."""
-        position = (number.clamp(min=1e-30) / self.lowest).log() if self.ratio else number
-        return (position / self.width).clamp(0, self.bins)
-
-    def middles(self, device=None):
-        """Positions of the middle of each bin."""
-        return torch.arange(self.bins, device=device) + 0.5
 
 
 class RmsNorm(nn.Module):
