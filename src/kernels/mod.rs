@@ -27,7 +27,7 @@ mod ops;
 mod peak;
 mod simd;
 #[cfg(test)]
-mod testing;
+pub(crate) mod testing;
 mod threads;
 mod written;
 
