@@ -14,9 +14,7 @@ use sdim::internals::supervise::{
     Asking, BatchConfig, BinLoss, Example, RecordConfig, RecordSet, SceneMix, Scenes, Shard, Target, VERSION,
     bins, example_of, frame, held_out_seed, training_seed,
 };
-use sdim::internals::vlm::qwen2_5::crops::Picture;
-use sdim::internals::vlm::qwen2_5::decoder::Keep;
-use sdim::internals::vlm::qwen2_5::sequences::Sequences;
+use sdim::internals::vlm::qwen2_5::{crops::Picture, decoder::Keep, sequences::Sequences};
 use sdim::settings::{Hint, NumberTokens, Settings};
 use sdim::{Error, LoadOptions, Result, WeightFormat};
 use std::borrow::Cow;
@@ -67,9 +65,8 @@ fn plain() -> Scenes {
 fn logits(model: &SdimModel, example: &Example) -> Result<Tensor> {
     let (w, h) = example.pixels.resized.dimensions();
     let scattered = Tensor::from_slice(&example.scattered, (1, h as usize, w as usize, 1), &Device::Cpu)?;
-    let image = model.encode(&example.pixels, &scattered)?;
     let prefix = &example.prefix;
-    let embedded = model.vlm.embed_prompt(&prefix.ids, &image)?;
+    let embedded = model.vlm.embed_prompt(&prefix.ids, &model.encode(&example.pixels, &scattered)?)?;
     let picture = Picture::new(Cow::Borrowed(&example.pixels.resized), &model.device)?;
     let embedded = model.add_glimpses(embedded, &[(&picture, &prefix.glimpses)])?;
     let decoder = &model.vlm.decoder;
