@@ -109,10 +109,12 @@ std::string environment(const char *name) {
 // The library of a module: of a file that is named, or of text.
 void *loaded(const std::string &image) {
     const std::string named = "// host-file ";
-    std::string folder = environment("SDIM_HOST_CUDA"), source, out;
+    std::string folder = environment("SDIM_HOST_CUDA"), source, out, toolkit;
     if (image.compare(0, named.size(), named) == 0) {
         source = image.substr(named.size(), image.find('\n') - named.size());
         out = folder + "/" + source.substr(source.rfind('/') + 1) + ".so";
+        std::string include = environment("CUDA_HOME") + "/include";
+        toolkit = " -DHOST_TOOLKIT '-I" + include + "' '-I" + include + "/cccl'";
     } else {
         size_t hash = std::hash<std::string>()(image);
         source = folder + "/" + std::to_string(hash) + ".cu";
@@ -122,8 +124,7 @@ void *loaded(const std::string &image) {
     if (access(out.c_str(), R_OK) != 0) {
         // Other processes may do so, too.
         std::string part = out + "." + std::to_string(getpid());
-        std::string command = "python3 '" + environment("SDIM_HOST_MODULE") + "' '" + source + "' '" + part + "'";
-        if (const char *more = getenv("SDIM_HOST_FLAGS")) command += std::string(" ") + more;
+        std::string command = "python3 '" + environment("SDIM_HOST_MODULE") + "' '" + source + "' '" + part + "'" + toolkit;
         if (system(command.c_str()) != 0 || rename(part.c_str(), out.c_str()) != 0) return nullptr;
     }
     void *library = dlopen(out.c_str(), RTLD_NOW);

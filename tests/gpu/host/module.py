@@ -31,11 +31,12 @@ extern "C" const HostKernel host_kernels[] = {
 
 def main():
     source, out, *arguments = sys.argv[1:]
-    common = ["g++", "-std=c++17", "-x", "c++", "-w", "-I", str(HERE), *arguments]
+    # As CUDA C, memory may be read as another type than it was written as.
+    common = ["g++", "-std=c++17", "-x", "c++", "-w", "-fno-strict-aliasing", "-I", str(HERE), *arguments]
     text = '#include <type_traits>\n#include <utility>\n#include "device.h"\n' + pathlib.Path(source).read_text()
     folder = str(pathlib.Path(source).resolve().parent)
     expanded = subprocess.run(
-        [*common, "-I", folder, f"-D__global__={MARK}", "-E", "-P", "-"], input=text, capture_output=True, text=True, check=True
+        [*common, "-I", folder, f"-D__global__={MARK}", "-E", "-P", "-"], input=text, stdout=subprocess.PIPE, text=True, check=True
     ).stdout
     names = re.findall(rf'extern\s+"C"\s+{MARK}\s+void\s+(\w+)\s*\(', expanded)
     entries = "".join(f'    {{"{n}", [](void **p) {{ host_call({n}, p); }}}},\n' for n in names)

@@ -1,7 +1,9 @@
 #!/usr/bin/env bash
 # Runs a program that was built for CUDA on a machine without a GPU: `libraries.cpp` beside this file stands in for CUDA's libraries.
 #
-#   tests/gpu/host/run.sh PROGRAM [ARGUMENT...]      needs g++ and Python; SDIM_HOST_CUDA names a folder for what is compiled
+#   tests/gpu/host/run.sh PROGRAM [ARGUMENT...]      needs g++ and Python
+#
+# CUDA_HOME names the toolkit, whose headers candle's kernels include; SDIM_HOST_CUDA a folder for what is compiled.
 set -euo pipefail
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 program=$1
