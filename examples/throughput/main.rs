@@ -7,6 +7,7 @@
 
 mod answers;
 mod cost;
+mod operations;
 mod shapes;
 
 use answers::{Answers, Numbers};
@@ -75,6 +76,10 @@ struct Args {
     /// cpu, cuda:N or metal.
     #[arg(long, default_value = "cpu")]
     device: String,
+    /// Instead of the stages: milliseconds of what lies between the products of a decoder layer, for `--batch` rows and a prefix of so many
+    /// tokens. `SDIM_CUDA_KERNELS=off` leaves out our kernels for CUDA.
+    #[arg(long, value_name = "TOKENS")]
+    operations: Option<usize>,
     /// One JSON object instead of the table.
     #[arg(long)]
     json: bool,
@@ -244,6 +249,14 @@ fn main() -> anyhow::Result<()> {
     }
     let device = device(&args.device)?;
     let config = args.config()?;
+    if let Some(prefix) = args.operations {
+        for (name, milliseconds) in
+            operations::times(&config.text, args.batch.max(1), prefix.max(1), &device)?
+        {
+            println!("{name:10}  {milliseconds:8.3} ms");
+        }
+        return Ok(());
+    }
     let side = config.vision.patch_size * config.vision.merge_size;
     let cells = |pixels: usize| pixels.div_ceil(side).max(1) * config.vision.merge_size;
     let grid = Grid { height: cells(args.height), width: cells(args.width) };

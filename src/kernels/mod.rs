@@ -20,14 +20,19 @@ mod attention;
 #[cfg(feature = "cuda")]
 mod cuda;
 mod exec;
+mod fused;
+#[cfg(test)]
+mod fused_tests;
 mod gemm;
 mod isa;
+mod kept;
 mod memory;
 mod ops;
 mod peak;
+mod rounded;
 mod simd;
 #[cfg(test)]
-mod testing;
+pub(crate) mod testing;
 mod threads;
 mod written;
 
@@ -35,6 +40,7 @@ pub use attention::{AttentionLayout, Block, Precision, SharedKeys, attention};
 #[cfg(feature = "cuda")]
 pub(crate) use cuda::{held_bytes, prepare};
 pub(crate) use exec::read;
+pub use fused::{rms_norm_rounded, swiglu_rounded, widen};
 pub use gemm::packed::{PackedGate, PackedWeight, RowMajor, WeightFormat};
 pub use memory::keep_freed_memory;
 pub use ops::{

@@ -17,11 +17,16 @@ pub(super) fn random(dims: &[usize], seed: u64) -> Tensor {
 /// These tensors on the device that `SDIM_TEST_DEVICE` names (`cuda:0`), the CPU without it: where the forms for other devices than the
 /// CPU are compared with the kernels, whose results stay on the CPU.
 pub(super) fn on_device<const N: usize>(tensors: [&Tensor; N]) -> [Tensor; N] {
+    tensors.map(|t| t.to_device(&test_device()).unwrap())
+}
+
+/// The device that `SDIM_TEST_DEVICE` names; the CPU without it.
+pub(crate) fn test_device() -> Device {
     static DEVICE: LazyLock<Device> = LazyLock::new(|| {
         let name = std::env::var("SDIM_TEST_DEVICE").unwrap_or_else(|_| "cpu".into());
         crate::system::device(&name).unwrap()
     });
-    tensors.map(|t| t.to_device(&DEVICE).unwrap())
+    DEVICE.clone()
 }
 
 pub(super) fn values(t: &Tensor) -> Vec<f32> {

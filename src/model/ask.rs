@@ -13,6 +13,7 @@ use crate::query::number::{DigitReader, NumberFormat};
 use crate::query::prompt::Tokens;
 use crate::query::settings::PixelReference;
 use crate::query::{Reading, Readout};
+use crate::vlm::qwen2_5::crops::bytes_per_crop;
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 
@@ -90,7 +91,9 @@ fn rows_within(model: &SdimModel, prefix: &Prefix, max_memory: Option<usize>) ->
     let scores = 2 * t.heads * prefix.cache.len();
     // So many values of each bin are there while its statistics are found.
     let read = 8 * model.number_rows.dims().0;
-    let bytes = (passing + kept + scores + read).max(1) * size_of::<f32>();
+    // Crops are cut before the pass.
+    let cut = model.prompts.settings().glimpse.map_or(0, bytes_per_crop);
+    let bytes = ((passing + kept + scores + read).max(1) * size_of::<f32>()).max(cut);
     (max_memory.unwrap_or(DEVICE_BYTES) / bytes).clamp(1, DEVICE_ROWS)
 }
 

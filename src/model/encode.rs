@@ -6,11 +6,11 @@ use crate::error::{Error, Result};
 use crate::fusion::Normalise;
 use crate::kernels;
 use crate::query::prompt::Glimpse;
+use crate::vlm::qwen2_5::crops::{Picture, joined};
 use crate::vlm::qwen2_5::grid::Grid;
 use crate::vlm::qwen2_5::preprocess::Pixels;
 use candle_core::Tensor;
 use image::RgbImage;
-use rayon::prelude::*;
 
 impl SdimModel {
     /// Resizes a frame and scatters its measurements: pixels, and `[1, h, w, 1]` of what the fusion block sees of a number, with 0
@@ -74,31 +74,29 @@ impl SdimModel {
         Ok(embedded)
     }
 
-    /// Adds the crop around its pixel to each token that stands at one; `groups` pairs images with the tokens that stand
+    /// Adds the crop around its pixel to each token that stands at one; `groups` pairs pictures with the tokens that stand
     /// in them, indices counting over all of `embedded`. Without a glimpse layer nothing changes.
     ///
     /// # Errors
     /// [`Error::Tensors`] if an index is out of range.
-    pub fn add_glimpses(&self, embedded: Tensor, groups: &[(&RgbImage, &[Glimpse])]) -> Result<Tensor> {
+    pub fn add_glimpses(&self, embedded: Tensor, groups: &[(&Picture, &[Glimpse])]) -> Result<Tensor> {
         let (Some(layer), Some(side)) = (&self.glimpse, self.prompts.settings().glimpse) else {
             return Ok(embedded);
         };
-        let count: usize = groups.iter().map(|(_, g)| g.len()).sum();
-        if count == 0 {
+        let rows: Vec<u32> =
+            groups.iter().flat_map(|(_, list)| list.iter().map(|g| g.token as u32)).collect();
+        if rows.is_empty() {
             return Ok(embedded);
         }
-        let len = 3 * side * side;
-        let mut crops = vec![0f32; count * len];
-        let all: Vec<(&RgbImage, Glimpse)> =
-            groups.iter().flat_map(|(image, list)| list.iter().map(move |g| (*image, *g))).collect();
-        crops.par_chunks_mut(len).zip(&all).for_each(|(crop, (image, g))| {
-            self.preprocessor.crop(image, g.x, g.y, side, crop);
+        let crops = groups.iter().filter(|(_, list)| !list.is_empty()).map(|(picture, list)| {
+            let places: Vec<(f32, f32)> = list.iter().map(|g| (g.x, g.y)).collect();
+            picture.crops(&self.preprocessor, &places, side)
         });
-        let added = layer.forward(&Tensor::from_vec(crops, (count, len), &self.device)?)?;
-        if all.iter().enumerate().all(|(i, (_, g))| g.token == i) && count == embedded.dim(0)? {
+        let added = layer.forward(&joined(crops.collect::<Result<Vec<_>>>()?)?)?;
+        if rows.len() == embedded.dim(0)? && (0..).zip(&rows).all(|(i, &row)| row == i) {
             return kernels::add(&embedded, &added);
         }
-        let rows: Vec<u32> = all.iter().map(|(_, g)| g.token as u32).collect();
+        let count = rows.len();
         Ok(embedded.index_add(&Tensor::from_vec(rows, count, &self.device)?, &added, 0)?)
     }
 }

@@ -8,11 +8,12 @@ use crate::kernels;
 use crate::query::prompt::FrameSpace;
 use crate::query::settings::PixelReference;
 use crate::vlm::qwen2_5::cache::KvCache;
+use crate::vlm::qwen2_5::crops::Picture;
 use crate::vlm::qwen2_5::decoder::Keep;
 use crate::vlm::qwen2_5::preprocess::Pixels;
 use candle_core::Tensor;
 use image::RgbImage;
-use std::sync::Arc;
+use std::borrow::Cow;
 
 /// What all queries of a frame share: its keys and values, read once, and its space.
 pub struct Prefix {
@@ -23,7 +24,7 @@ pub struct Prefix {
     /// Where pixels lie, and what numbers mean.
     pub space: FrameSpace,
     /// The resized frame, for the crops around pixels.
-    pub image: Arc<RgbImage>,
+    pub image: Picture<'static>,
     /// The frame that each query marks for itself, for [`PixelReference::Marker`].
     pub marked: Option<MarkedFrame>,
 }
@@ -82,7 +83,7 @@ impl SdimModel {
             let embedded = self.vlm.decoder.embed(&shared.ids)?;
             self.vlm.prefill(&embedded, &shared.positions, &mut cache, Keep::Nothing)?;
         }
-        let image = Arc::new(pixels.resized.clone());
+        let image = self.picture(pixels)?;
         Ok(Prefix { cache, ids: shared.ids, space, image, marked: Some(frame.with_opening(opening)) })
     }
 
@@ -98,11 +99,15 @@ impl SdimModel {
     ) -> Result<Prefix> {
         let resized = (pixels.resized.width() as usize, pixels.resized.height() as usize);
         let (tokens, space) = self.prompts.prefix(sparse, pixels.grid, resized, &self.vlm.config, 0)?;
-        let image = Arc::new(pixels.resized.clone());
+        let image = self.picture(pixels)?;
         let embedded = self.vlm.embed_prompt(&tokens.ids, image_tokens)?;
         let embedded = self.add_glimpses(embedded, &[(&image, &tokens.glimpses)])?;
         let mut cache = self.vlm.decoder.cache(1);
         self.vlm.prefill(&embedded, &tokens.positions, &mut cache, Keep::Nothing)?;
         Ok(Prefix { cache, ids: tokens.ids, space, image, marked: None })
+    }
+
+    fn picture(&self, pixels: &Pixels) -> Result<Picture<'static>> {
+        Picture::new(Cow::Owned(pixels.resized.clone()), &self.device)
     }
 }

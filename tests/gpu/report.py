@@ -1,4 +1,5 @@
-"""Lines of the table of run.sh: `frame LOG` of a JSON object, `model LOG` of one or more, `maps A B` of two .npy files of depths."""
+"""Lines of the table of run.sh: `frame LOG` of a JSON object, `model LOG` of one or more, `operations LOG LOG` of our
+kernels and of candle's, `maps A B` of two .npy files of depths."""
 
 import array
 import json
@@ -35,6 +36,16 @@ def model(path):
         )
 
 
+def operations(*paths):
+    found = []
+    for path in paths:
+        with open(path) as file:
+            found.append({name.strip(): float(ms.split()[0]) for name, ms in (line.rsplit("  ", 1) for line in file if line.endswith(" ms\n"))})
+    for name, ours in found[0].items():
+        other = found[1].get(name, math.nan)
+        print(f"    {name:10} {ours:7.3f} ms, candle's {other:7.3f} ms, {other / ours:.1f} times")
+
+
 def depths(path):
     with open(path, "rb") as file:
         head = file.read(10)
@@ -54,6 +65,6 @@ def maps(a, b):
 
 
 try:
-    {"frame": frame, "model": model, "maps": maps}[sys.argv[1]](*sys.argv[2:])
+    {"frame": frame, "model": model, "maps": maps, "operations": operations}[sys.argv[1]](*sys.argv[2:])
 except (OSError, ValueError, KeyError, IndexError) as error:
     print(f"    nothing to report: {type(error).__name__} {error}"[:160])

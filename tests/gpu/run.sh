@@ -79,6 +79,16 @@ model() {
     python3 "$work/report.py" model "$out/logs/$name.log" >>"$table"
 }
 
+# Milliseconds of each operation, by our kernels and by candle's; a warning that ours are left out stands in the log.
+operations() {
+    local limit=$1 name
+    for name in ours candle; do
+        check "operations-$name" "$limit" env SDIM_CUDA_KERNELS=$([ $name = ours ] && echo on || echo off) "$work/bin/throughput" \
+            --random 3b --device cuda:0 --batch 2048 --operations 411 || return 0
+    done
+    python3 "$work/report.py" operations "$out/logs/operations-ours.log" "$out/logs/operations-candle.log" >>"$table"
+}
+
 # The same 3B work in PyTorch and here, where transformers is installed. PyTorch copies the prefix for each item of a batch.
 peers() {
     local limit=$1
@@ -114,7 +124,10 @@ compare cpu-f32 cuda-bf16
 tests golden 45 golden --skip formats --test-threads 4
 tests device 45 device --test-threads 2
 # Those unit tests of the kernels that choose their device, `on_device` in src/kernels/testing.rs, with the ones beside them.
-tests kernels 20 lib kernels::ops::norm kernels::ops::rope kernels::ops::bin_rows kernels::attention::batched
+tests kernels 25 lib kernels::cuda kernels::fused_tests kernels::attention::batched kernels::ops::norm kernels::ops::rope kernels::ops::bin_rows \
+    vlm::qwen2_5::crops
+# What lies between the products of a layer of the 3B shapes, with and without our kernels.
+operations 30
 model 3b-bf16 60 --random 3b --weights bf16 --queries 4096 --batch 2048 --rounds 3
 # A frame of 644x476 with one number token for an answer: every fourth column and row, then every pixel.
 model 3b-number-tokens 75 --random 3b --weights bf16 --numbers bins --queries 19159,306544 --batch 4096 --rounds 2

@@ -1,13 +1,18 @@
 //! Attention on a device without kernels of ours, where no gradient is wanted: few large products, no more scores at once than fit.
 
 use super::composed::in_order;
-use super::layout::{AttentionLayout, Block};
+use super::layout::{AttentionLayout, Block, Precision};
+use super::rounded::{rounded_piece, takes};
 use crate::error::Result;
+use crate::kernels::fused;
+use crate::kernels::kept::Kept;
 use candle_core::{Device, Tensor};
-use std::sync::{Mutex, PoisonError};
+use std::sync::Arc;
 
 /// Scores that are held at once, at most: 512 MB, and as much again for their softmax.
 const MAX_SCORES: usize = 1 << 27;
+/// Elements of a mask that is kept, at most: 32 MB.
+const MAX_KEPT: usize = 1 << 23;
 
 /// [`attention()`](super::attention) of f32 tensors that fit the layout, `shared` being the extra pair.
 pub(super) fn batched(
@@ -17,15 +22,41 @@ pub(super) fn batched(
     shared: Option<(&Tensor, &Tensor)>,
     layout: &AttentionLayout,
 ) -> Result<Tensor> {
-    if let Some((order, layout)) = sorted_by_size(layout, q.dim(0)?) {
+    let rounded = layout.precision == Precision::Bf16 && fused::rounds_attention(q.device());
+    if let Some(sorted) = sorted(layout, q)? {
+        let [q, k, v] = [q, k, v].map(|t| t.index_select(&sorted.order, 0));
+        let (q, k, v) = (q?, k?, v?);
+        let layout = AttentionLayout { blocks: sorted.blocks.clone(), ..layout.clone() };
+        let out = in_pieces(&q, [&k, &v], [&k, &v], &layout, MAX_SCORES, rounded)?;
+        return Ok(out.index_select(&sorted.places, 0)?);
+    }
+    in_pieces(q, [k, v], shared.unwrap_or((k, v)).into(), layout, MAX_SCORES, rounded)
+}
+
+/// Blocks in the order of their size.
+struct Sorted {
+    /// Rows in their order.
+    order: Tensor,
+    /// Where each row is then.
+    places: Tensor,
+    blocks: Vec<Block>,
+}
+
+/// [`sorted_by_size`] on the device of `q`; the last ones are kept.
+fn sorted(layout: &AttentionLayout, q: &Tensor) -> Result<Option<Arc<Sorted>>> {
+    /// Of what a picture's windows and a batch of several pictures have.
+    static LAST: Kept<(Vec<Block>, usize), Option<Arc<Sorted>>> = Kept::new(4);
+    if layout.blocks.len() < 2 {
+        return Ok(None);
+    }
+    let rows = q.dim(0)?;
+    LAST.get((layout.blocks.clone(), rows), q.device(), |_| {
+        let Some((order, sorted)) = sorted_by_size(layout, rows) else { return Ok(None) };
         let mut places = vec![0u32; order.len()];
         order.iter().zip(0..).for_each(|(&row, place)| places[row as usize] = place);
-        let pick = |t: &Tensor, rows: &[u32]| t.index_select(&Tensor::new(rows, q.device())?, 0);
-        let [q, k, v] = [pick(q, &order)?, pick(k, &order)?, pick(v, &order)?];
-        let sorted = in_pieces(&q, [&k, &v], [&k, &v], &layout, MAX_SCORES)?;
-        return Ok(pick(&sorted, &places)?);
-    }
-    in_pieces(q, [k, v], shared.unwrap_or((k, v)).into(), layout, MAX_SCORES)
+        let [order, places] = [order, places].map(|rows| Tensor::new(rows, q.device()));
+        Ok(Some(Arc::new(Sorted { order: order?, places: places?, blocks: sorted.blocks })))
+    })
 }
 
 /// Where all of so many rows are in blocks that see themselves alone, and sizes alternate, as windows at the border of a picture do: the rows
@@ -57,10 +88,14 @@ fn in_pieces(
     shared: [&Tensor; 2],
     layout: &AttentionLayout,
     most: usize,
+    rounded: bool,
 ) -> Result<Tensor> {
     let joined = joined(&layout.blocks);
     let all = joined.iter().flat_map(|block| pieces(block, layout.heads, most));
-    in_order(q, layout, all, |piece| one_piece(q, own, shared, layout, piece))
+    in_order(q, layout, all, |piece| {
+        let attend = if rounded && takes(piece) { rounded_piece } else { one_piece };
+        attend(q, own, shared, layout, piece)
+    })
 }
 
 /// The blocks that have rows, in order; those that go on where the one before ends, with items of the same kind, as one: windows of a
@@ -171,23 +206,20 @@ fn one_piece(
     Ok(out.reshape((rows, heads * hd))?)
 }
 
-/// 0 where a row sees a key of its item, minus infinity where not: `[q_period, k_period]`. The last one is kept: all layers of a model
+/// 0 where a row sees a key of its item, minus infinity where not: `[q_period, k_period]`. The last ones are kept: all layers of a model
 /// ask for the same.
 fn mask(block: &Block, device: &Device) -> Result<Tensor> {
-    static LAST: Mutex<Option<Tensor>> = Mutex::new(None);
+    static LAST: Kept<(usize, usize), Tensor> = Kept::new(4);
     let (qp, kp) = (block.q_period, block.k_period);
-    let mut last = LAST.lock().unwrap_or_else(PoisonError::into_inner);
-    if let Some(mask) = last.as_ref()
-        && mask.dims() == [qp, kp]
-        && mask.device().same_device(device)
-    {
-        return Ok(mask.clone());
-    }
-    let values: Vec<f32> =
-        (0..qp * kp).map(|at| if at % kp < block.seen(at / kp) { 0.0 } else { f32::NEG_INFINITY }).collect();
-    let mask = Tensor::from_vec(values, (qp, kp), device)?;
-    *last = Some(mask.clone());
-    Ok(mask)
+    let make = || -> Result<Tensor> {
+        // Places of keys and of the last key that a row sees; the mask is made of them where it lies.
+        let keys = Tensor::arange(0f32, kp as f32, device)?.reshape((1, kp))?;
+        let last = (Tensor::arange(0f32, qp as f32, device)? + (kp - qp) as f64)?.reshape((qp, 1))?;
+        let unseen = keys.broadcast_gt(&last)?;
+        let [hidden, seen] = [f32::NEG_INFINITY, 0.0].map(|value| Tensor::full(value, (qp, kp), device));
+        Ok(unseen.where_cond(&hidden?, &seen?)?)
+    };
+    if qp * kp > MAX_KEPT { make() } else { LAST.get((qp, kp), device, |_| make()) }
 }
 
 #[cfg(test)]
@@ -241,7 +273,12 @@ mod tests {
             close(&batched(&q, &k, &v, extra, &layout).unwrap(), &expected, 1e-5);
             let shared = extra.unwrap_or((&k, &v)).into();
             for most in [1, 200, 700, 2000] {
-                close(&in_pieces(&q, [&k, &v], shared, &layout, most).unwrap(), &expected, 1e-5);
+                close(&in_pieces(&q, [&k, &v], shared, &layout, most, false).unwrap(), &expected, 1e-5);
+            }
+            // Rounded to bf16: eight bits of each probability and value.
+            for most in [200, 2000] {
+                let found = in_pieces(&q, [&k, &v], shared, &layout, most, true).unwrap();
+                close(&found, &expected, 1e-2);
             }
         }
     }

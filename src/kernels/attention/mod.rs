@@ -1,7 +1,8 @@
 //! Attention over blocks of rows, without masks.
 //!
 //! A `layout` says which row sees which keys, a `plan` cuts the work into tiles of rows and sets of keys, and `dispatch` chooses the form:
-//! `f32` (with gradients), `bf16` (without), or for other devices and types of candle operations: `batched` (without) or `composed` (with).
+//! `f32` (with gradients), `bf16` (without), or for other devices and types of candle operations: `batched` (without; `rounded` has
+//! its products of bf16) or `composed` (with).
 
 mod batched;
 mod bf16;
@@ -12,6 +13,7 @@ mod inputs;
 mod layout;
 mod own_keys;
 mod plan;
+mod rounded;
 mod shared_keys;
 #[cfg(test)]
 mod tests;

@@ -31,11 +31,11 @@ pub fn bin_stats_of_rows(
             (weights.broadcast_mul(&values)?.sum_keepdim(1)? / &total)?
         }
     };
-    let mut found = Tensor::cat(&[&max, &total, &found], 1)?.to_vec2::<f32>()?;
+    let mut found: Vec<f32> = Tensor::cat(&[&max, &total, &found], 1)?.flatten_all()?.to_vec1()?;
     if let Middle::Mean { position, .. } = middle {
-        found.iter_mut().for_each(|row| row[2] = position(row[2]));
+        found.chunks_exact_mut(3).for_each(|row| row[2] = position(row[2]));
     }
-    let middles: Vec<f32> = found.iter().map(|row| row[2]).collect();
+    let middles: Vec<f32> = found.chunks_exact(3).map(|row| row[2]).collect();
     let within: Vec<f32> = middles.iter().map(|&m| if m.is_nan() { 0.0 } else { tolerance(m) }).collect();
     let (middles, within) =
         (Tensor::from_vec(middles, (n, 1), device)?, Tensor::from_vec(within, (n, 1), device)?);
@@ -44,8 +44,8 @@ pub fn bin_stats_of_rows(
     let off = (&weights * &distances)?.sum(D::Minus1)?.to_vec1::<f32>()?;
     let near = (weights * distances.broadcast_le(&within)?.to_dtype(DType::F32)?)?;
     let near = near.sum(D::Minus1)?.to_vec1::<f32>()?;
-    let rows = found.iter().zip(off).zip(near).map(|((row, off), near)| {
-        let &[max, total, middle] = &row[..] else { return None };
+    let rows = found.chunks_exact(3).zip(off).zip(near).map(|((row, off), near)| {
+        let &[max, total, middle] = row else { return None };
         let readable = max.is_finite() && !total.is_nan();
         let (spread, near) = (off / total, (near / total).clamp(0.0, 1.0));
         readable.then_some(BinStats { middle, spread, near })

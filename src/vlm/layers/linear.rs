@@ -7,7 +7,7 @@ use crate::kernels::{self, PackedWeight};
 use crate::vlm::checkpoint::lora::LoraMode;
 use crate::vlm::checkpoint::raw::{self, Raw};
 use crate::vlm::checkpoint::weights::Weights;
-use candle_core::Tensor;
+use candle_core::{DType, Tensor};
 
 /// A layer as it is found, before its weight is kept in some form.
 pub(crate) struct Found<'w> {
@@ -78,22 +78,18 @@ impl Linear {
         }
     }
 
-    /// Whether [`Linear::forward_rounded`] gives another type than f32.
-    pub(super) fn rounds(&self) -> bool {
-        self.lora.is_none() && self.weight.rounded_type().is_some()
+    /// The type that its input is rounded to, where that is another one than f32 and nothing else reads the input.
+    pub(crate) fn input_type(&self) -> Option<DType> {
+        self.weight.rounded_type().filter(|_| self.lora.is_none())
     }
 
-    /// [`Linear::forward`] in the type in which the matrix is multiplied, for what goes into another product of that type.
-    pub(super) fn forward_rounded(&self, x: &Tensor) -> Result<Tensor> {
-        match (&self.weight, self.rounds()) {
-            (Matrix::Plain(weight), true) => {
-                let y = kernels::linear(&x.to_dtype(weight.dtype())?, weight, None)?;
-                Ok(match &self.bias {
-                    Some(bias) => y.broadcast_add(&bias.to_dtype(weight.dtype())?)?,
-                    None => y,
-                })
+    /// The product alone, in the type in which the matrix is multiplied; `None` where [`Linear::input_type`] is none.
+    pub(super) fn rounded_product(&self, x: &Tensor) -> Result<Option<Tensor>> {
+        match (&self.weight, self.input_type()) {
+            (Matrix::Plain(weight), Some(dtype)) => {
+                Ok(Some(kernels::linear(&x.to_dtype(dtype)?, weight, None)?))
             }
-            _ => self.forward(x),
+            _ => Ok(None),
         }
     }
 
@@ -104,7 +100,10 @@ impl Linear {
     pub fn forward_onto(&self, x: &Tensor, residual: &Tensor) -> Result<Tensor> {
         match (&self.weight, &self.lora) {
             (Matrix::Packed(packed), None) => packed.linear_onto(x, self.bias.as_ref(), residual),
-            _ => kernels::add(residual, &self.forward(x)?),
+            _ => match self.rounded_product(x)? {
+                Some(y) => kernels::widen(&y, self.bias.as_ref(), Some(residual)),
+                None => kernels::add(residual, &self.forward(x)?),
+            },
         }
     }
 
@@ -116,16 +115,32 @@ impl Linear {
         array(match (&self.weight, &self.lora) {
             (Matrix::Packed(packed), None) => packed.linear_parts(x, self.bias.as_ref(), &widths)?,
             _ => {
-                let all = self.forward(x)?;
+                let (all, finished) = match self.rounded_product(x)? {
+                    Some(y) => (y, false),
+                    None => (self.forward(x)?, true),
+                };
                 let mut first = 0;
                 let part = |width| {
+                    let columns = all.narrow(1, first, width)?;
+                    let bias = self.bias.as_ref().map(|bias| bias.narrow(0, first, width)).transpose()?;
                     first += width;
-                    Ok(all.narrow(1, first - width, width)?.contiguous()?)
+                    if finished {
+                        Ok(columns.contiguous()?)
+                    } else {
+                        kernels::widen(&columns, bias.as_ref(), None)
+                    }
                 };
                 widths.into_iter().map(part).collect::<Result<_>>()?
             }
         })
     }
+}
+
+/// [`Linear::input_type`] of layers that have one.
+pub(super) fn common_type<'a>(layers: impl IntoIterator<Item = &'a Linear>) -> Option<DType> {
+    let mut types = layers.into_iter().map(Linear::input_type);
+    let first = types.next()?;
+    first.filter(|_| types.all(|other| other == first))
 }
 
 fn array<const N: usize>(parts: Vec<Tensor>) -> Result<[Tensor; N]> {
@@ -174,6 +189,14 @@ impl<const N: usize> JoinedLinear<N> {
         self.first(x)
     }
 
+    /// [`Linear::input_type`], where it is that of all layers.
+    pub(crate) fn input_type(&self) -> Option<DType> {
+        match &self.form {
+            Joined::Apart(layers) => common_type(layers),
+            Joined::Packed { .. } => None,
+        }
+    }
+
     /// [`JoinedLinear::forward`] of the first `M` layers alone.
     ///
     /// # Errors
@@ -183,9 +206,9 @@ impl<const N: usize> JoinedLinear<N> {
         array(match &self.form {
             Joined::Apart(layers) => {
                 // Rounded once for all of them, if it is.
-                let x = match layers[0].weight.rounded_type() {
-                    Some(dtype) if layers.iter().all(Linear::rounds) => &x.to_dtype(dtype)?,
-                    _ => x,
+                let x = match self.input_type() {
+                    Some(dtype) => &x.to_dtype(dtype)?,
+                    None => x,
                 };
                 layers[..count].iter().map(|l| l.forward(x)).collect::<Result<_>>()?
             }

@@ -73,13 +73,7 @@ impl Matrix {
     pub fn linear(&self, x: &Tensor, bias: Option<&Tensor>) -> Result<Tensor> {
         match self {
             Self::Plain(t) if t.dtype() == DType::F32 => kernels::linear(x, t, bias),
-            Self::Plain(t) => {
-                let y = kernels::linear(&x.to_dtype(t.dtype())?, t, None)?.to_dtype(DType::F32)?;
-                Ok(match bias {
-                    Some(bias) => y.broadcast_add(bias)?,
-                    None => y,
-                })
-            }
+            Self::Plain(t) => kernels::widen(&kernels::linear(&x.to_dtype(t.dtype())?, t, None)?, bias, None),
             Self::Packed(p) => p.linear(x, bias),
         }
     }

@@ -1,11 +1,11 @@
 //! The gated MLP of both towers.
 
-use super::linear::{Found, Linear};
+use super::linear::{Found, Linear, common_type};
 use super::matrix::Matrix;
 use crate::error::Result;
 use crate::kernels::{self, PackedGate};
 use crate::vlm::checkpoint::weights::Weights;
-use candle_core::Tensor;
+use candle_core::{DType, Tensor};
 
 /// The two projections of a gated MLP that read the same input.
 pub(super) enum GateUp {
@@ -47,14 +47,27 @@ impl GatedMlp {
                 return kernels::packed_mlp(both, x, down, bias.as_ref(), residual);
             }
             (GateUp::Joined(both), _) => both.apply(x)?,
-            // Off the CPU: what lies between two products of one type need not leave it.
-            (GateUp::Apart { gate, up }, down) if [gate, up, down].iter().all(|l| l.rounds()) => {
-                let x =
-                    gate.weight.rounded_type().map_or_else(|| Ok(x.clone()), |dtype| x.to_dtype(dtype))?;
-                kernels::swiglu(&gate.forward_rounded(&x)?, &up.forward_rounded(&x)?)?
-            }
-            (GateUp::Apart { gate, up }, _) => kernels::swiglu(&gate.forward(x)?, &up.forward(x)?)?,
+            (GateUp::Apart { gate, up }, _) => match self.rounded_products(gate, up, x)? {
+                // Off the CPU: what lies between two products of one type need not leave it.
+                Some([g, u]) => kernels::swiglu_rounded([&g, &u], [gate.bias.as_ref(), up.bias.as_ref()])?,
+                None => kernels::swiglu(&gate.forward(x)?, &up.forward(x)?)?,
+            },
         };
         self.down.forward_onto(&gated, residual)
+    }
+    /// [`Linear::input_type`], where it is that of all three layers.
+    pub(crate) fn input_type(&self) -> Option<DType> {
+        match &self.inputs {
+            GateUp::Apart { gate, up } => common_type([gate, up, &self.down]),
+            GateUp::Joined(_) => None,
+        }
+    }
+
+    /// The products of both projections, where all three layers multiply in one rounded type.
+    fn rounded_products(&self, gate: &Linear, up: &Linear, x: &Tensor) -> Result<Option<[Tensor; 2]>> {
+        let Some(dtype) = self.input_type() else { return Ok(None) };
+        let x = x.to_dtype(dtype)?;
+        let [g, u] = [gate.rounded_product(&x)?, up.rounded_product(&x)?];
+        Ok(g.zip(u).map(|(g, u)| [g, u]))
     }
 }

@@ -3,7 +3,7 @@
 use crate::error::Result;
 use crate::kernels;
 use crate::vlm::checkpoint::weights::Weights;
-use candle_core::Tensor;
+use candle_core::{DType, Tensor};
 
 /// RMSNorm with its weight; eps differs between the vision encoder (1e-6, fixed) and the decoder (config).
 pub struct RmsNorm {
@@ -26,5 +26,16 @@ impl RmsNorm {
     /// [`crate::Error::Tensors`] on another width.
     pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
         kernels::rms_norm(x, &self.weight, self.eps)
+    }
+
+    /// [`RmsNorm::forward`] in the type that what reads it rounds its input to, if it does.
+    ///
+    /// # Errors
+    /// As [`RmsNorm::forward`].
+    pub fn forward_as(&self, x: &Tensor, dtype: Option<DType>) -> Result<Tensor> {
+        match dtype {
+            Some(dtype) => kernels::rms_norm_rounded(x, &self.weight, self.eps, dtype),
+            None => self.forward(x),
+        }
     }
 }

@@ -74,9 +74,14 @@ impl KvCache {
         }
         let rows = items.iter().flat_map(|&i| (i * self.len..(i + 1) * self.len).map(|r| r as u32));
         let rows: Vec<u32> = rows.collect();
-        let pick = |t: &Tensor| -> Result<Tensor> {
-            let index = Tensor::from_slice(&rows, rows.len(), t.device())?;
-            Ok(t.index_select(&index, 0)?)
+        // The same for all layers: it goes to the device once.
+        let mut index: Option<Tensor> = None;
+        let mut pick = |t: &Tensor| -> Result<Tensor> {
+            let index = match &index {
+                Some(index) => index,
+                None => index.insert(Tensor::from_slice(&rows, rows.len(), t.device())?),
+            };
+            Ok(t.index_select(index, 0)?)
         };
         let layers = self.layers.iter().map(|layer| match layer {
             Some(old) => Ok(Some(SharedKeys::new(pick(old.keys())?, pick(old.values())?))),

@@ -64,7 +64,7 @@ impl DecoderLayer {
         index: usize,
         context: &mut Context,
     ) -> Result<Tensor> {
-        let normed = self.input_layernorm.forward(x)?;
+        let normed = self.input_layernorm.forward_as(x, self.kvq_proj.input_type())?;
         let Some(kept) = kept else {
             let [k, v, q] = self.kvq_proj.forward(&normed)?;
             let keys = Keys::new(k, v, table, layout, index, context)?;
@@ -90,7 +90,7 @@ impl DecoderLayer {
         let q = kernels::rope(q, &table.cos, &table.sin, layout.heads)?;
         let x =
             self.o_proj.forward_onto(&kernels::attention(&q, &keys.k, &keys.v, keys.shared, layout)?, x)?;
-        self.mlp.forward_onto(&self.post_attention_layernorm.forward(&x)?, &x)
+        self.mlp.forward_onto(&self.post_attention_layernorm.forward_as(&x, self.mlp.input_type())?, &x)
     }
 }
 

@@ -5,6 +5,7 @@
 
 pub mod cache;
 pub mod config;
+pub mod crops;
 pub mod decoder;
 pub mod grid;
 mod model;

@@ -186,6 +186,12 @@ impl PreprocessorConfig {
         Ok(Tensor::from_vec(rows, (order.len(), len), device)?)
     }
 
+    /// What a value of 0 to 255 between samples is multiplied by, and what is taken from that then, to normalise it; of each channel.
+    pub(super) fn scale_and_shift(&self) -> ([f32; 3], [f32; 3]) {
+        let scale = self.image_std.map(|deviation| 1.0 / (255.0 * deviation));
+        (scale, std::array::from_fn(|c| self.image_mean[c] / self.image_std[c]))
+    }
+
     /// A normalised crop of `side` x `side` pixels around a place between pixels, bilinear, the border repeated; written as
     /// channel, y, x into `out`, which holds 3 x `side` x `side` values.
     pub fn crop(&self, image: &RgbImage, x: f32, y: f32, side: usize, out: &mut [f32]) {
@@ -195,10 +201,7 @@ impl PreprocessorConfig {
         let (x0, y0) = (first(x), first(y));
         let (fx, fy) = (x0 - x0.floor(), y0 - y0.floor());
         let (x0, y0) = (x0.floor() as i64, y0.floor() as i64);
-        let scale: [(f32, f32); 3] = std::array::from_fn(|c| {
-            let s = 1.0 / (255.0 * self.image_std[c]);
-            (s, self.image_mean[c] / self.image_std[c])
-        });
+        let (scale, shift) = self.scale_and_shift();
         for dy in 0..side {
             let row = |y: i64| y.clamp(0, h - 1) * w;
             let (top, bottom) = (row(y0 + dy as i64), row(y0 + dy as i64 + 1));
@@ -206,7 +209,7 @@ impl PreprocessorConfig {
                 let left = (x0 + dx as i64).clamp(0, w - 1);
                 let right = (x0 + dx as i64 + 1).clamp(0, w - 1);
                 let corners = [top + left, top + right, bottom + left, bottom + right];
-                for (c, (s, m)) in scale.iter().enumerate() {
+                for (c, (s, m)) in scale.iter().zip(&shift).enumerate() {
                     let [a, b, d, e] = corners.map(|i| f32::from(raw[i as usize * 3 + c]));
                     let (u, v) = (a + (b - a) * fx, d + (e - d) * fx);
                     out[(c * side + dy) * side + dx] = (u + (v - u) * fy) * s - m;

@@ -3,6 +3,7 @@
 use super::config::TextConfig;
 use crate::error::Result;
 use candle_core::{Device, Tensor};
+use std::sync::OnceLock;
 
 /// Cosines and sines of rotary angles, each `[tokens, head_dim / 2]`, f32.
 #[derive(Debug, Clone)]
@@ -91,6 +92,8 @@ pub enum RopeLayout {
 pub struct MRope {
     inverse: Vec<f32>,
     axis: Vec<usize>,
+    /// Off the CPU: what a token's three numbers are multiplied by, `[3, head_dim / 2]`, on the device that asked first.
+    there: OnceLock<Tensor>,
 }
 
 impl MRope {
@@ -113,7 +116,7 @@ impl MRope {
                 })
                 .collect(),
         };
-        Self { inverse, axis }
+        Self { inverse, axis, there: OnceLock::new() }
     }
 
     /// The table of these positions.
@@ -135,14 +138,25 @@ impl MRope {
     /// Angles of these positions, `[tokens, head_dim / 2]`, as a product: each column has one frequency, at its axis. So three numbers of each
     /// token go to the device.
     fn angles(&self, positions: &[Position], device: &Device) -> Result<Tensor> {
-        let half = self.inverse.len();
         let places: Vec<f32> = positions.iter().flat_map(|p| [p.t, p.h, p.w]).collect();
+        let places = Tensor::from_vec(places, (positions.len(), 3), device)?;
+        if let Some(frequencies) = self.there.get().filter(|t| t.device().same_device(device)) {
+            return Ok(places.matmul(frequencies)?);
+        }
+        let frequencies = self.frequencies(device)?;
+        let out = places.matmul(&frequencies)?;
+        // One that another thread has put there meanwhile, or that of another device, stays.
+        let _ = self.there.set(frequencies);
+        Ok(out)
+    }
+
+    fn frequencies(&self, device: &Device) -> Result<Tensor> {
+        let half = self.inverse.len();
         let mut frequencies = vec![0f32; 3 * half];
         for (k, (f, &axis)) in self.inverse.iter().zip(&self.axis).enumerate() {
             frequencies[axis * half + k] = *f;
         }
-        let places = Tensor::from_vec(places, (positions.len(), 3), device)?;
-        Ok(places.matmul(&Tensor::from_vec(frequencies, (3, half), device)?)?)
+        Ok(Tensor::from_vec(frequencies, (3, half), device)?)
     }
 }
 

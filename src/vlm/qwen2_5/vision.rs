@@ -41,11 +41,12 @@ impl VisionBlock {
 
     /// `[patches, hidden]` to the same.
     fn forward(&self, x: &Tensor, table: &RopeTable, layout: &AttentionLayout) -> Result<Tensor> {
-        let [q, k, v] = self.qkv.forward_parts(&self.norm1.forward(x)?, [x.dim(1)?; 3])?;
+        let normed = self.norm1.forward_as(x, self.qkv.input_type())?;
+        let [q, k, v] = self.qkv.forward_parts(&normed, [x.dim(1)?; 3])?;
         let q = kernels::rope(&q, &table.cos, &table.sin, layout.heads)?;
         let k = kernels::rope(&k, &table.cos, &table.sin, layout.heads)?;
         let x = self.proj.forward_onto(&kernels::attention(&q, &k, &v, None, layout)?, x)?;
-        self.mlp.forward_onto(&self.norm2.forward(&x)?, &x)
+        self.mlp.forward_onto(&self.norm2.forward_as(&x, self.mlp.input_type())?, &x)
     }
 }
 
@@ -205,7 +206,8 @@ impl VisionTower {
     /// States in window order to image tokens in their own order.
     fn merge(&self, x: &Tensor, order: &WindowOrder, trace: Option<&mut VisionTrace>) -> Result<Tensor> {
         let unit = self.config.merge_size * self.config.merge_size;
-        let x = self.ln_q.forward(x)?.reshape(((), unit * self.config.hidden_size))?;
+        let x =
+            self.ln_q.forward_as(x, self.mlp0.input_type())?.reshape(((), unit * self.config.hidden_size))?;
         let x = self.mlp2.forward(&kernels::gelu_erf(&self.mlp0.forward(&x)?)?)?;
         if let Some(t) = trace {
             t.merger = Some(x.clone());

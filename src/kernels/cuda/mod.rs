@@ -1,8 +1,18 @@
-//! What a CUDA device is told before it works.
+//! CUDA devices: what one is told before it works, and kernels of ours.
+//!
+//! `kernels.cu` holds the kernels, `compiled` compiles them for a device, `launches` calls them, `trial` says whether they may be used.
+
+mod compiled;
+mod launches;
+mod trial;
+
+pub(super) use launches::{
+    fits, heads_first, heads_last, probabilities, product, rms_norm, shared_probabilities, swiglu, widen,
+};
 
 use crate::error::Result;
-use candle_core::CudaDevice;
 use candle_core::cuda_backend::cudarc::driver::{DriverError, result, sys};
+use candle_core::{CudaDevice, Device};
 use std::ffi::c_void;
 
 /// Readies a device that has one stream, on which all of its work runs.
@@ -15,6 +25,14 @@ pub(crate) fn prepare(device: &CudaDevice) -> Result<()> {
         keep_freed_memory(device).map_err(candle_core::Error::wrap)?;
     }
     Ok(())
+}
+
+/// Our kernels for a device, where it has some: a CUDA device of compute capability 8 or more.
+pub(super) fn kernels(device: &Device) -> Option<compiled::Compiled<'_>> {
+    match device {
+        Device::Cuda(cuda) => trial::kernels(cuda),
+        _ => None,
+    }
 }
 
 /// Whether candle's kernels for bf16 are there for the device: they are from compute capability 8 (Ampere) on.
