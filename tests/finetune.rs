@@ -12,10 +12,10 @@ use common::program::program;
 use sdim::benchmarks::{Layout, LayoutOptions};
 use sdim::internals::model::SdimModel;
 use sdim::internals::supervise::{Example, PromptShard};
-use sdim::internals::vlm::qwen2_5::decoder::Keep;
-use sdim::internals::vlm::qwen2_5::sequences::Sequences;
+use sdim::internals::vlm::qwen2_5::{crops::Picture, decoder::Keep, sequences::Sequences};
 use sdim::settings::{LoraMode, Settings};
 use sdim::{Adapter, Error, LoadOptions, WeightFormat};
+use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
@@ -30,7 +30,8 @@ fn first_logits(model: &SdimModel, example: &Example) -> Tensor {
     let image = model.encode(&example.pixels, &scattered).unwrap();
     let prefix = &example.prefix;
     let embedded = model.vlm.embed_prompt(&prefix.ids, &image).unwrap();
-    let embedded = model.add_glimpses(embedded, &[(&example.pixels.resized, &prefix.glimpses)]).unwrap();
+    let picture = Picture::new(Cow::Borrowed(&example.pixels.resized), &CPU).unwrap();
+    let embedded = model.add_glimpses(embedded, &[(&picture, &prefix.glimpses)]).unwrap();
     let decoder = &model.vlm.decoder;
     let mut shared = decoder.cache(1);
     model.vlm.prefill(&embedded, &prefix.positions, &mut shared, Keep::Nothing).unwrap();
@@ -41,7 +42,7 @@ fn first_logits(model: &SdimModel, example: &Example) -> Tensor {
             // Without the tokens of the answer that stand behind the first.
             let asked = item.tokens.len() + 1 - item.supervised;
             let embedded = decoder.embed(&item.tokens.ids[..asked]).unwrap();
-            let group = (&example.pixels.resized, item.tokens.glimpses.as_slice());
+            let group = (&picture, item.tokens.glimpses.as_slice());
             let embedded = model.add_glimpses(embedded, &[group]).unwrap();
             let positions = &item.tokens.positions[..asked];
             let one = Sequences::prefill(decoder, Some(&shared), &embedded, positions, vec![0.0]).unwrap();

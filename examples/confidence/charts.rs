@@ -42,12 +42,8 @@ pub fn sparsification(path: &Path, pool: &Pool) -> anyhow::Result<()> {
     }
     let points = sparsification_curve(errors, errors, STEPS).unwrap_or_default();
     curves.push(Curve { name: "by the errors themselves", points, marked: false });
-    draw(
-        path,
-        "Sparsification",
-        ["share of pixels removed", "mean error of the rest by that of all"],
-        &curves,
-    )
+    let axes = ["share of pixels removed", "mean error of the rest by that of all"];
+    draw(path, "Sparsification", axes, SeriesLabelPosition::UpperRight, &curves)
 }
 
 fn draw(

@@ -140,7 +140,7 @@ impl RecordConfig {
             index,
             config: serde_json::to_value(self)
                 .map_err(|e| Error::format("prompts", e.to_string(), "a configuration that JSON can hold"))?,
-            settings: asking.prompts.settings().clone(),
+            settings: asking.prompts.settings().of_the_shape(),
             frames: Vec::new(),
             numbers: asking.prompts.numbers().ids.clone(),
             image: asking.config.ids.image,

@@ -180,7 +180,7 @@ fn every_layout_is_scored() {
     let fixture =
         |name: &str| Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/benchmarks").join(name);
     // Layout, place, frames, and measured pixels per frame where they are the data set's own.
-    let cases: [(&str, PathBuf, usize, Option<f64>); 9] = [
+    let cases: [(&str, PathBuf, usize, Option<f64>); 11] = [
         ("kitti", kitti.path().into(), 2, Some(3.0)),
         ("ddad", ddad.path().into(), 2, Some(1.0)),
         ("ddad", drawn.path().into(), 2, Some(39.0)),
