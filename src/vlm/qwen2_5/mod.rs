@@ -7,6 +7,7 @@ pub mod cache;
 pub mod config;
 pub mod decoder;
 pub mod grid;
+mod interrupt;
 mod model;
 pub mod patch_embed;
 pub mod positions;
@@ -16,4 +17,5 @@ pub mod sequences;
 pub mod token_table;
 pub mod vision;
 
+pub use interrupt::Interrupt;
 pub use model::QwenVl;
