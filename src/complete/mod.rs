@@ -3,6 +3,7 @@
 mod adaptive;
 mod alignment;
 mod belief;
+mod carry;
 mod cells;
 mod clock;
 mod follow;
