@@ -11,6 +11,7 @@ use criterion::{Criterion, SamplingMode, Throughput, criterion_group, criterion_
 use sdim::WeightFormat;
 use sdim::internals::fusion::{Fusion, Normalise};
 use sdim::internals::vlm::checkpoint::weights::Weights;
+use sdim::internals::vlm::qwen2_5::Interrupt;
 use sdim::internals::vlm::qwen2_5::cache::KvCache;
 use sdim::internals::vlm::qwen2_5::config::{VisionConfig, VlmConfig};
 use sdim::internals::vlm::qwen2_5::decoder::{Context, Decoder, Keep};
@@ -104,7 +105,9 @@ fn table(rope: &MRope, from: usize, tokens: usize) -> RopeTable {
 
 /// The layer with all its outputs.
 fn pass(decoder: &Decoder, x: &Tensor, table: &RopeTable, shared: Option<&KvCache>, own: &mut KvCache) {
-    decoder.forward_keeping(x, table, Context::Cached { shared, own }, Keep::All).expect("a pass");
+    decoder
+        .forward_keeping(x, table, Context::Cached { shared, own }, Keep::All, Interrupt::NEVER)
+        .expect("a pass");
 }
 
 fn decoder(c: &mut Criterion) {

@@ -48,6 +48,9 @@ struct Args {
     /// Frames after which an answer counts half.
     #[arg(long)]
     half_life: Option<f32>,
+    /// Frames in a row that may be made of the last map alone; 0 to ask about each frame.
+    #[arg(long)]
+    rest: Option<usize>,
     /// Does not tell the stream where the camera is.
     #[arg(long)]
     no_poses: bool,
@@ -71,6 +74,10 @@ fn pose(frame: f64, depth: f64, speed: f64) -> sdim::Result<Transform> {
 struct Sums {
     seconds: f64,
     asked: usize,
+    /// Frames without a question.
+    rested: usize,
+    /// Seconds of the stages that a frame alone has, too; what is left of the time is the moving of the last map.
+    stages: [f64; 5],
     error: f64,
     /// Mean changes of static pixels, metres.
     flicker: Vec<f64>,
@@ -86,6 +93,12 @@ impl Sums {
         pairs: &[Pair],
     ) -> sdim::Result<()> {
         self.asked += done.asked;
+        self.rested += usize::from(done.asked == 0);
+        let s = &done.seconds;
+        for (sum, seconds) in self.stages.iter_mut().zip([s.check, s.encode, s.prefill, s.queries, s.refine])
+        {
+            *sum += seconds;
+        }
         self.error += f64::from(metrics::errors(done.map.depth(), &frame.depth, sparse)?.mae as f32);
         if let Some(before) = self.before.as_ref().filter(|_| !pairs.is_empty()) {
             let change = |p: &Pair| {
@@ -99,6 +112,8 @@ impl Sums {
         Ok(())
     }
 }
+
+const STAGES: [&str; 5] = ["check", "encode", "prefill", "questions", "refine"];
 
 /// A point that is seen in two frames: its pixels, and how a depth at the one becomes a depth at the other.
 struct Pair {
@@ -123,14 +138,24 @@ fn pairs(before: &[f32], now: &[f32], camera: &Camera, motion: &Transform) -> Ve
     (0..before.len()).filter_map(pair).collect()
 }
 
+/// What is measured beside the completing.
+#[derive(Default)]
+struct Around {
+    /// Seconds for rendering the frames.
+    rendering: f64,
+    /// The most memory that was held after a tenth of the frames.
+    early: Option<u64>,
+}
+
 /// Completes the frames of one scene, in both ways.
-fn run(args: &Args, seed: u64, sums: &mut [Sums; 2], early: &mut Option<u64>) -> anyhow::Result<()> {
+fn run(args: &Args, seed: u64, sums: &mut [Sums; 2], around: &mut Around) -> anyhow::Result<()> {
     let completer = load_as(&args.model, &load_options("cpu", None, None)?)?;
     let complete = CompleteOptions::default().with_plan(args.plan);
     let scene = Scene::procedural(seed, args.width, args.height)?;
     let camera = Camera::new(args.width, args.height, scene.intrinsics(), Distortion::None)?;
     let mut options = StreamOptions::default().with_complete(complete.clone()).with_camera(camera);
     options.half_life = args.half_life.unwrap_or(options.half_life);
+    options.rest = args.rest.unwrap_or(options.rest);
     let mut stream = Stream::new(completer.clone(), options)?;
     let mut depths: Vec<f32> = scene.render(&Transform::identity()).depth;
     depths.retain(|d| d.is_finite());
@@ -140,7 +165,9 @@ fn run(args: &Args, seed: u64, sums: &mut [Sums; 2], early: &mut Option<u64>) ->
     sums.iter_mut().for_each(|s| s.before = None);
     for i in 0..args.frames {
         let pose = pose(i as f64, typical, args.speed)?;
+        let start = Instant::now();
         let frame = scene.render(&pose);
+        around.rendering += start.elapsed().as_secs_f64();
         let sparse = sample_points(&frame.depth, args.width, args.height, args.points, seed + i as u64)?;
         let seen = match &before {
             Some((depth, last)) => pairs(depth, &frame.depth, &camera, &last.then(&pose.inverse())),
@@ -156,8 +183,8 @@ fn run(args: &Args, seed: u64, sums: &mut [Sums; 2], early: &mut Option<u64>) ->
             sums[way].add(done, &frame, &sparse, &seen)?;
         }
         before = Some((frame.depth, pose));
-        if i == args.frames / 10 && early.is_none() {
-            *early = system::peak_rss_bytes();
+        if i == args.frames / 10 && around.early.is_none() {
+            around.early = system::peak_rss_bytes();
         }
     }
     Ok(())
@@ -167,19 +194,26 @@ fn main() -> anyhow::Result<()> {
     let args = Args::parse();
     anyhow::ensure!(args.frames > 0 && args.scenes > 0, "--frames and --scenes must be at least 1");
     let mut sums = <[Sums; 2]>::default();
-    let mut early = None;
+    let mut around = Around::default();
     for seed in args.seed..args.seed + args.scenes {
-        run(&args, seed, &mut sums, &mut early)?;
+        run(&args, seed, &mut sums, &mut around)?;
     }
     let late = system::peak_rss_bytes();
     let n = args.frames as f64 * args.scenes as f64;
     let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len().max(1) as f64;
     let row = |s: &Sums| [n / s.seconds, s.asked as f64 / n, s.error / n, mean(&s.flicker)];
+    let (early, rendering, rested) = (around.early, around.rendering, sums[1].rested);
     let [single, stream] = [row(&sums[0]), row(&sums[1])];
     let text = if args.json {
-        let object = |[rate, asked, mae, flicker]: [f64; 4]| json!({ "frames_per_second": rate, "asked": asked, "mae": mae, "flicker": flicker });
+        let object = |[rate, asked, mae, flicker]: [f64; 4], s: &Sums| {
+            let stages: serde_json::Map<_, _> =
+                STAGES.iter().zip(s.stages).map(|(k, v)| (k.to_string(), json!(v / n))).collect();
+            json!({ "frames_per_second": rate, "asked": asked, "mae": mae, "flicker": flicker, "seconds": stages })
+        };
         json!({
-            "frames": n, "single": object(single), "stream": object(stream),
+            "frames": n, "single": object(single, &sums[0]), "stream": object(stream, &sums[1]),
+            "without_questions": rested,
+            "rendering_s": rendering,
             "peak_bytes_early": early, "peak_bytes": late,
         })
         .to_string()
@@ -188,12 +222,19 @@ fn main() -> anyhow::Result<()> {
             let (mae, flicker) = (rounded(mae), rounded(flicker));
             format!("{name} {rate:6.2} frames/s  {asked:6.0} questions  MAE {mae} m  flicker {flicker} m\n")
         };
+        let stages = |name: &str, s: &Sums| {
+            let parts = STAGES.iter().zip(s.stages).map(|(k, v)| format!("{k} {:.1}", 1e3 * v / n));
+            let all = parts.collect::<Vec<_>>().join(", ");
+            format!("{name} milliseconds of a frame: {all}, in all {:.1}\n", 1e3 * s.seconds / n)
+        };
         let ratio = |i: usize| stream[i] / single[i];
         let mib = |bytes: Option<u64>| bytes.map_or("unknown".into(), |b| format!("{} MiB", b >> 20));
         format!(
-            "{}{}ratio  {:6.2}          {:6.2}            {:.3}          {:.3}\nmemory {} at most after a tenth of the frames, {} in the end",
+            "{}{}{}{}ratio  {:6.2}          {:6.2}            {:.3}          {:.3}\n{rested} of {n} frames of the stream without a question\nmemory {} at most after a tenth of the frames, {} in the end; rendering took {rendering:.1} s",
             line("single", single),
             line("stream", stream),
+            stages("single", &sums[0]),
+            stages("stream", &sums[1]),
             ratio(0),
             ratio(1),
             ratio(2),

@@ -189,6 +189,14 @@ fn progress_counts_up_and_a_token_stops() {
     assert_eq!(calls.last().unwrap().0, calls.last().unwrap().1);
     cancel.cancel();
     assert!(matches!(TINY.complete(&rgb, &sparse, &watched), Err(Error::Cancelled)));
+    assert!(seen.lock().unwrap().is_empty(), "who has cancelled waits for no batch");
+    let cancel = sdim::CancelToken::default();
+    let (log, token) = (seen.clone(), cancel.clone());
+    let stopping = watched.with_cancel(cancel).with_progress(move |p| {
+        log.lock().unwrap().push((p.answered, p.planned));
+        token.cancel();
+    });
+    assert!(matches!(TINY.complete(&rgb, &sparse, &stopping), Err(Error::Cancelled)));
     assert_eq!(seen.lock().unwrap().len(), 1, "stops after the first batch");
 }
 

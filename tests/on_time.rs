@@ -5,9 +5,11 @@ mod common;
 use image::RgbImage;
 use sdim::depth::sample_points;
 use sdim::internals::scenes::procedural;
-use sdim::{CompleteOptions, DepthCompleter, Error, Outliers, Preserve, QueryPlan, Region, SparseDepth};
+use sdim::{
+    CompleteOptions, DepthCompleter, Error, Outliers, Preserve, QueryPlan, Region, SparseDepth, metrics,
+};
 use std::sync::{Arc, LazyLock, Mutex};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 static TINY: LazyLock<DepthCompleter> =
     LazyLock::new(|| DepthCompleter::tiny_with(&common::load_options()).unwrap());
@@ -61,6 +63,41 @@ fn with_all_the_time_there_is_the_map_is_that_of_all_questions() {
     for (a, b) in every.depth().iter().zip(done.depth()) {
         assert!((a - b).abs() <= 1e-3 * a, "{a} is not {b}");
     }
+}
+
+#[test]
+fn a_budget_buys_more_than_a_lattice_and_the_same_map_each_time() {
+    let (mut lattice, mut budget) = (0.0, 0.0);
+    for seed in [3_000_007, 3_000_011, 3_000_012] {
+        let frame = procedural(seed, SIZE.0, SIZE.1).unwrap();
+        let sparse = sample_points(&frame.depth, SIZE.0, SIZE.1, 60, 1).unwrap();
+        let complete = |plan| TINY.complete_detailed(&frame.rgb, &sparse, &options(plan)).unwrap();
+        let error = |done: &sdim::Completion| {
+            f64::from(metrics::errors(done.map.depth(), &frame.depth, &sparse).unwrap().mae as f32)
+        };
+        let (even, chosen) = (complete(QueryPlan::Stride(8)), complete(QueryPlan::Budget(300)));
+        assert!(chosen.asked <= 300 + sparse.measured() && even.asked + 10 >= chosen.asked);
+        lattice += error(&even);
+        budget += error(&chosen);
+        let again = complete(QueryPlan::Budget(300));
+        let bits = |done: &sdim::Completion| done.map.depth().iter().map(|d| d.to_bits()).collect::<Vec<_>>();
+        assert!(bits(&chosen) == bits(&again), "the same frame and budget, the same map");
+    }
+    assert!(budget < lattice, "MAE {budget} with as many questions as {lattice}");
+}
+
+#[test]
+fn a_deadline_is_kept_by_the_machine_there_is() {
+    let (rgb, sparse) = frame(60);
+    // Of some frames the best, and several times the deadline: another program's load is no fault of ours.
+    let time = Duration::from_millis(400);
+    let took = |_| {
+        let start = Instant::now();
+        TINY.complete(&rgb, &sparse, &deadline(time)).unwrap();
+        start.elapsed()
+    };
+    let best = (0..4).map(took).min().unwrap();
+    assert!(best < 2 * time, "{best:?} of {time:?}");
 }
 
 #[test]

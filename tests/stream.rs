@@ -141,6 +141,61 @@ fn what_appears_is_seen() {
 }
 
 #[test]
+fn a_frame_that_the_last_map_covers_needs_no_model() {
+    for rest in [0, 1, 3] {
+        let (mut asked, mut errors) = (Vec::new(), [0.0, 0.0]);
+        for seed in [5_000_001, 5_000_002] {
+            let (camera, frames) = sequence(seed, SIZE, 6, 60);
+            let options = StreamOptions::default()
+                .with_complete(complete(QueryPlan::Stride(4)))
+                .with_camera(camera)
+                .with_rest(rest);
+            let mut stream = Stream::new(TINY.clone(), options).unwrap();
+            for seen in &frames {
+                let next = stream.push(&seen.rgb, &seen.sparse, Some(&seen.pose)).unwrap();
+                assert!(next.map.keeps(&seen.sparse) && next.map.valid() == SIZE.0 * SIZE.1);
+                asked.push(next.asked);
+                if next.asked == 0 {
+                    let alone = complete(QueryPlan::Stride(4));
+                    let alone = TINY.complete_detailed(&seen.rgb, &seen.sparse, &alone).unwrap();
+                    errors = [errors[0] + error(&alone, seen), errors[1] + error(&next, seen)];
+                }
+            }
+        }
+        let silent = |w: &[usize]| w.iter().all(|&n| n == 0);
+        assert_eq!(asked.contains(&0), rest > 0, "{asked:?}");
+        assert!(!asked.windows(rest + 1).any(silent), "no more than {rest} in a row: {asked:?}");
+        assert!(errors[1] <= errors[0], "MAE {errors:?}");
+    }
+}
+
+#[test]
+fn what_contradicts_the_last_map_is_asked_about_at_once() {
+    let (_, frames) = sequence(5_000_001, SIZE, 1, 60);
+    let seen = &frames[0];
+    let asked_of = |rgb: &RgbImage, sparse: &SparseDepth| {
+        let mut stream = stream(&TINY, None);
+        stream.push(&seen.rgb, &seen.sparse, None).unwrap();
+        stream.push(rgb, sparse, None).unwrap().asked
+    };
+    assert_eq!(asked_of(&seen.rgb, &seen.sparse), 0, "the same frame again");
+    // A pane of glass comes to stand there: the picture is as before.
+    let near = |(x, y, depth)| (x, y, if x < SIZE.0 / 3 { 0.5 * depth } else { depth });
+    let points: Vec<_> = seen.sparse.points().map(near).collect();
+    let sparse = SparseDepth::from_points(SIZE.0, SIZE.1, &points).unwrap();
+    assert!(asked_of(&seen.rgb, &sparse) > 0);
+    // Something else is seen in a twelfth of the picture, where nothing is measured.
+    let mut rgb = seen.rgb.clone();
+    let inside = |x: u32, y: u32| (60..100).contains(&x) && (40..80).contains(&y);
+    rgb.enumerate_pixels_mut()
+        .filter(|(x, y, _)| inside(*x, *y))
+        .for_each(|(_, _, p)| *p = Rgb([250, 30, 200]));
+    let outside = seen.sparse.points().filter(|p| !inside(p.0 as u32, p.1 as u32));
+    let sparse = SparseDepth::from_points(SIZE.0, SIZE.1, &outside.collect::<Vec<_>>()).unwrap();
+    assert!(asked_of(&rgb, &sparse) > 0);
+}
+
+#[test]
 fn the_same_frames_give_the_same_maps_on_any_thread() {
     let (camera, frames) = sequence(5_000_001, (64, 48), 4, 20);
     let maps = |completer: DepthCompleter| -> Vec<Vec<u32>> {

@@ -3,7 +3,7 @@
 use image::RgbImage;
 
 use super::points::PointCloud;
-use crate::depth::{Camera, DepthMap, check_camera, normals};
+use crate::depth::{Camera, DepthMap, normals};
 use crate::error::{Error, Result};
 
 /// Which points of a map are taken, and what is added to them. The default takes every valid pixel and adds no normals.
@@ -60,7 +60,7 @@ impl PointCloud {
         options: &CloudOptions,
     ) -> Result<Self> {
         options.check()?;
-        check_camera(map, camera)?;
+        camera.require_size("camera", "the size of the map", (map.width(), map.height()))?;
         let (width, height) = (map.width(), map.height());
         if let Some(rgb) = rgb
             && (rgb.width() as usize, rgb.height() as usize) != (width, height)

@@ -2,17 +2,16 @@
 
 use super::alignment::{Alignment, Anchors};
 use super::cells::{Cell, Cells};
-use super::pace::{Clock, Seconds};
+use super::clock::Clock;
+use super::pace::Seconds;
 use super::prior::Prior;
 use super::questions::{Answers, Questions, answered, scaled};
+use super::schedule::{TimeLeft, shuffled};
 use crate::error::Result;
 use crate::query::plan::stride_within;
 use crate::query::told::choose_evenly;
 use crate::query::{QueryPlan, Reading};
 use crate::refine::Answered;
-use rand::SeedableRng;
-use rand::seq::SliceRandom;
-use rand_chacha::ChaCha8Rng;
 use std::collections::HashSet;
 
 /// One of so many rows and columns of the lattice is asked as a check.
@@ -23,7 +22,7 @@ const ANCHORS: (usize, usize) = (64, 2048);
 /// How far a measurement lies from what is expected around it when that is wrong, in log depth. Four frames of one sequence, 96x72 with 40
 /// measurements: 236 questions a frame and MAE 0.85 of that of frames alone with 0.25 and one cell around, 281 and 0.90 with 0.1 and two
 /// cells, the first frame (471 questions) included.
-const MEASURED_APART: f32 = 0.25;
+pub(super) const MEASURED_APART: f32 = 0.25;
 /// How far an answer lies from what is expected when that is wrong, in log depth: this, and so many expected errors of both.
 const APART: f32 = 0.1;
 const PER_ERROR: f32 = 1.5;
@@ -35,8 +34,6 @@ const DOUBT: f32 = 0.03;
 const AROUND: usize = 1;
 /// The lattice's stride under a deadline.
 const FOLLOWED: usize = 4;
-/// What one answer is taken to cost before any was seen, seconds.
-const UNSEEN_ANSWER: f64 = 1e-3;
 
 impl Questions<'_> {
     /// Asks where the expected map is unknown, unsure, has an edge or is contradicted, and some pixels everywhere as a check; elsewhere
@@ -62,14 +59,14 @@ impl Questions<'_> {
             false => None,
         };
         let mut answers = Answers { spacing: stride, follows: true, ..Default::default() };
-        let refine = pace.refine * (width * height) as f64;
-        let mut seconds = pace.answer.unwrap_or(UNSEEN_ANSWER);
+        let mut time = clock.map(|clock| TimeLeft {
+            clock,
+            refining: pace.refining(width * height),
+            answer: pace.answer,
+        });
         // Where the time may end before the pixels do, those that were asked are to be spread over the frame, and others in each frame.
-        let ask = |mut pixels: Vec<(usize, usize)>, into: &mut Answers, seconds: &mut f64| match &clock {
-            Some(clock) => {
-                pixels.shuffle(&mut ChaCha8Rng::seed_from_u64(prior.turn as u64));
-                self.ask_while(clock, refine, seconds, &pixels, into)
-            }
+        let ask = |pixels: Vec<(usize, usize)>, into: &mut Answers, time: &mut Option<TimeLeft>| match time {
+            Some(time) => self.ask_while(time, &shuffled(pixels, prior.turn), into),
             None => self.ask_plan(&pixels, into.asked + pixels.len(), into).map(|()| true),
         };
         let due = |(i, cell): &(usize, &Cell)| {
@@ -77,15 +74,17 @@ impl Questions<'_> {
         };
         let first: Vec<_> = cells.iter().enumerate().filter(due).map(|(_, cell)| cell.pixel).collect();
         if self.options.align {
-            let fitting = |clock: Clock| clock.fits(refine, seconds) as usize;
-            let most = clock.map_or(usize::MAX, |clock| fitting(clock) / ANCHOR_SHARE);
+            let most = time.as_ref().map_or(usize::MAX, |time| time.fits() / ANCHOR_SHARE);
             let count = (first.len() / ANCHOR_SHARE).clamp(ANCHORS.0, ANCHORS.1).min(most);
             let measured = choose_evenly(self.sparse, count, 0);
             let planned = measured.len() + first.len();
-            self.ask_anchors(measured, planned, &mut answers)?;
+            match &mut time {
+                Some(time) => self.anchors_while(time, measured, planned, &mut answers)?,
+                None => self.ask_anchors(&measured, planned, &mut answers)?,
+            }
         }
         let asked: HashSet<(usize, usize)> = first.iter().copied().collect();
-        let mut whole = ask(first, &mut answers, &mut seconds)?;
+        let mut whole = ask(first, &mut answers, &mut time)?;
         let by_answers = self.alignment(&answers)?;
         answers.settled = self.aligned_by(by_answers.as_ref(), &std::mem::take(&mut answers.readings));
         for answer in &answers.settled {
@@ -96,7 +95,7 @@ impl Questions<'_> {
         }
         let late = |cell: &&Cell| cell.ask && !asked.contains(&cell.pixel) && self.wanted(cell.pixel);
         let second: Vec<_> = cells.iter().filter(late).map(|cell| cell.pixel).collect();
-        whole &= ask(second, &mut answers, &mut seconds)?;
+        whole &= ask(second, &mut answers, &mut time)?;
         let late = self.aligned_by(by_answers.as_ref(), &std::mem::take(&mut answers.readings));
         answers.settled.extend(late);
         self.settle(prior, &cells, alignment.as_ref(), &mut answers);

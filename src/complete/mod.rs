@@ -1,8 +1,11 @@
 //! The one function that users call: an RGB frame and sparse depth in, dense depth out.
 
+mod adaptive;
 mod alignment;
 mod belief;
+mod carry;
 mod cells;
+mod clock;
 mod follow;
 mod options;
 mod pace;
@@ -10,6 +13,9 @@ mod prior;
 mod questions;
 mod schedule;
 mod stages;
+
+#[cfg(all(test, feature = "tiny"))]
+mod deadline_tests;
 
 pub use options::{
     CancelToken, CompleteOptions, Outliers, Partial, Preserve, PreviewCallback, Progress, ProgressCallback,
@@ -26,14 +32,14 @@ use crate::query::QueryPlan;
 use crate::refine::Answered;
 use crate::vlm::checkpoint::LoadOptions;
 use crate::vlm::qwen2_5::preprocess::MAX_RATIO;
-use belief::believe;
+use belief::{Reader, believe};
+use clock::Clock;
 use image::RgbImage;
-use pace::{Clock, Pace};
+use pace::Pace;
 use questions::Questions;
 use std::collections::HashMap;
 use std::path::Path;
 use std::sync::Arc;
-use std::time::Instant;
 
 /// A dense map with what it took.
 #[derive(Debug, Clone)]
@@ -151,38 +157,50 @@ impl DepthCompleter {
         options: &CompleteOptions,
         prior: Option<&Prior>,
     ) -> Result<Completion> {
-        let start = Instant::now();
+        let start = self.pace.watch().now();
         self.check(rgb, sparse, options)?;
+        let (watch, pace) = (self.pace.watch(), self.pace.seconds());
         let pixels = sparse.width() * sparse.height();
-        let pace = self.pace.seconds();
         let clock = match options.plan {
-            QueryPlan::Deadline(time) => Some(Clock::new(start, time)),
+            QueryPlan::Deadline(time) => Some(Clock::new(watch, start, time)),
             _ => None,
         };
-        let needed = (pace.prefix.unwrap_or(0.0) + pace.refine) * pixels as f64;
-        if clock.is_some_and(|clock| clock.left() < needed) {
+        let refining = pace.refining(pixels);
+        if clock.is_some_and(|c| c.left() < pace.prefix.unwrap_or(0.0) * pixels as f64 + refining) {
             self.pace.skipped();
-            return Completion::interpolated(sparse, &[], options, start);
+            return self.interpolated(sparse, &[], options, start);
         }
         let mut seconds = StageSeconds::default();
         let _span =
             tracing::info_span!("complete", width = sparse.width(), height = sparse.height()).entered();
-        let believed = believe(&self.model, rgb, sparse, options, &mut seconds)?;
+        let cancelled = || options.cancel.as_ref().is_some_and(CancelToken::is_cancelled);
+        // Questions that there is no time for any more need no prefix.
+        let least = refining.max(pace.interpolating(pixels));
+        let off = || cancelled() || clock.is_some_and(|c| c.left() < least);
+        let reader = Reader { model: &self.model, options, watch, off: &off };
+        let mark = watch.now();
+        let believed = match believe(&reader, rgb, sparse, &mut seconds) {
+            Err(Error::Cancelled) if !cancelled() => {
+                self.pace.interrupted(pixels, watch.since(mark));
+                return self.interpolated(sparse, &[], options, start);
+            }
+            other => other?,
+        };
         let span = tracing::info_span!("queries").entered();
-        let mark = Instant::now();
-        let questions = Questions::new(&self.model, rgb, &believed, options)?;
+        let mark = watch.now();
+        let questions = Questions::new(&self.model, rgb, &believed, options, watch)?;
         let answers = match prior {
             Some(prior) => questions.ask_following(prior, clock, pace)?,
             None => questions.ask_all(clock, pace)?,
         };
         drop(span);
-        seconds.queries = mark.elapsed().as_secs_f64();
+        seconds.queries = watch.since(mark);
         let _refine = tracing::info_span!("refine").entered();
-        let mark = Instant::now();
+        let mark = watch.now();
         let asked = answers.asked + believed.asked;
         if answers.is_empty() && clock.is_some() {
-            let late = Completion::interpolated(&believed.sparse, &believed.flagged, options, start)?;
-            self.pace.learn(pixels, &seconds, 0);
+            let late = self.interpolated(&believed.sparse, &believed.flagged, options, start)?;
+            self.pace.learn(pixels, &seconds, (answers.asked, answers.seconds));
             return Ok(Completion {
                 asked,
                 seconds: StageSeconds { total: late.seconds.total, ..seconds },
@@ -190,12 +208,26 @@ impl DepthCompleter {
             });
         }
         let (map, flagged) = questions.dense(&answers)?;
-        seconds.refine = mark.elapsed().as_secs_f64();
-        // What a preview took is no answer's time.
-        let timed = if options.preview.is_none() { answers.asked } else { 0 };
-        self.pace.learn(pixels, &seconds, timed);
-        seconds.total = start.elapsed().as_secs_f64();
+        seconds.refine = watch.since(mark);
+        self.pace.learn(pixels, &seconds, (answers.asked, answers.seconds));
+        seconds.total = watch.since(start);
         Ok(Completion { map, asked, flagged, seconds, interpolated: false })
+    }
+
+    /// For want of time: the measurements, interpolated.
+    fn interpolated(
+        &self,
+        sparse: &SparseDepth,
+        flagged: &[(usize, usize, f32)],
+        options: &CompleteOptions,
+        start: f64,
+    ) -> Result<Completion> {
+        let watch = self.pace.watch();
+        let mark = watch.now();
+        let (map, flagged) = questions::interpolated(sparse, flagged, options)?;
+        self.pace.interpolated(sparse.width() * sparse.height(), watch.since(mark));
+        let seconds = StageSeconds { total: watch.since(start), ..Default::default() };
+        Ok(Completion { map, asked: 0, flagged, seconds, interpolated: true })
     }
 
     /// How far some pixels are, without the rest of the frame: `pixels` are (column, row), the answers come in their order, in metres. A
@@ -230,8 +262,10 @@ impl DepthCompleter {
             let expected = format!("a column below {} and a row below {}", sparse.width(), sparse.height());
             return Err(Error::argument("pixel", format!("({x}, {y})"), expected));
         }
-        let believed = believe(&self.model, rgb, sparse, &options, &mut StageSeconds::default())?;
-        let questions = Questions::new(&self.model, rgb, &believed, &options)?;
+        let off = || options.cancel.as_ref().is_some_and(CancelToken::is_cancelled);
+        let reader = Reader { model: &self.model, options: &options, watch: self.pace.watch(), off: &off };
+        let believed = believe(&reader, rgb, sparse, &mut StageSeconds::default())?;
+        let questions = Questions::new(&self.model, rgb, &believed, &options, self.pace.watch())?;
         let answers = questions.ask_pixels(pixels)?;
         let said: HashMap<(usize, usize), Answered> =
             questions.aligned(&answers)?.into_iter().map(|a| ((a.x, a.y), a)).collect();
@@ -277,19 +311,5 @@ impl DepthCompleter {
             }
             _ => Ok(()),
         }
-    }
-}
-
-impl Completion {
-    /// For want of time: the measurements, interpolated.
-    fn interpolated(
-        sparse: &SparseDepth,
-        flagged: &[(usize, usize, f32)],
-        options: &CompleteOptions,
-        start: Instant,
-    ) -> Result<Self> {
-        let (map, flagged) = questions::interpolated(sparse, flagged, options)?;
-        let seconds = StageSeconds { total: start.elapsed().as_secs_f64(), ..Default::default() };
-        Ok(Self { map, asked: 0, flagged, seconds, interpolated: true })
     }
 }

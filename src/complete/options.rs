@@ -69,7 +69,7 @@ pub struct Progress {
 pub struct CancelToken(Arc<AtomicBool>);
 
 impl CancelToken {
-    /// Asks to stop; the call returns [`crate::Error::Cancelled`] after the batch that runs.
+    /// Asks to stop; the call returns [`crate::Error::Cancelled`] after the batch, or the layer of the model, that runs.
     pub fn cancel(&self) {
         self.0.store(true, Ordering::Relaxed);
     }

@@ -1,6 +1,7 @@
 //! The questions about one frame, the alignment of their answers to the measurements, and the dense map that comes of both.
 
 use super::alignment::{Alignment, Anchors};
+use super::clock::Watch;
 use super::options::{CancelToken, CompleteOptions, Outliers, Preserve, Progress, Region};
 use crate::depth::outliers::Outlier;
 use crate::depth::{DepthMap, SparseDepth, interpolate};
@@ -28,6 +29,8 @@ pub(super) struct Answers {
     pub(super) follows: bool,
     /// Pixels asked, those for the alignment included.
     pub(super) asked: usize,
+    /// How long the asking took.
+    pub(super) seconds: f64,
     /// Distance between the plan's pixels where they lie least dense.
     pub(super) spacing: usize,
 }
@@ -50,6 +53,7 @@ pub(super) struct Questions<'a> {
     pub(super) options: &'a CompleteOptions,
     /// Linear interpolation of all measurements, metres; empty if the checkpoint takes no hint.
     hint: Vec<f32>,
+    watch: &'a Watch,
 }
 
 impl<'a> Questions<'a> {
@@ -58,13 +62,14 @@ impl<'a> Questions<'a> {
         rgb: &'a RgbImage,
         believed: &'a super::belief::Believed<'a>,
         options: &'a CompleteOptions,
+        watch: &'a Watch,
     ) -> Result<Self> {
         let (prefix, sparse, flagged) = (&believed.prefix, &*believed.sparse, &*believed.flagged);
         let hint = match model.prompts.settings().hint {
             Hint::Linear => interpolate::linear(sparse)?,
             Hint::None => Vec::new(),
         };
-        Ok(Self { model, prefix, rgb, sparse, flagged, options, hint })
+        Ok(Self { model, prefix, rgb, sparse, flagged, options, hint, watch })
     }
 
     /// What is made of the confidence of answers.
@@ -100,14 +105,15 @@ impl<'a> Questions<'a> {
         self.model.prompts.states_measurement(&self.query(pixel, true))
     }
 
-    /// Asks at pixels; `before` were answered before them, `planned` will be in all.
+    /// Asks at pixels; `planned` will be in all.
     fn ask(
         &self,
         pixels: &[(usize, usize)],
         tell: bool,
-        before: usize,
         planned: usize,
+        into: &mut Answers,
     ) -> Result<Vec<Reading>> {
+        let (mark, before) = (self.watch.now(), into.asked);
         let queries: Vec<Query> = pixels.iter().map(|&p| self.query(p, tell)).collect();
         let mut progress = |answered| {
             if let Some(callback) = &self.options.progress {
@@ -118,7 +124,10 @@ impl<'a> Questions<'a> {
         let (mode, max_memory) = (self.options.answer.as_ref(), self.options.max_memory);
         let options =
             AskOptions { mode, readout: self.options.readout, max_memory, progress: Some(&mut progress) };
-        ask(self.model, self.prefix, &queries, options)
+        let readings = ask(self.model, self.prefix, &queries, options)?;
+        into.asked += readings.len();
+        into.seconds += self.watch.since(mark);
+        Ok(readings)
     }
 
     /// Asks at pixels of the plan.
@@ -128,8 +137,7 @@ impl<'a> Questions<'a> {
         planned: usize,
         into: &mut Answers,
     ) -> Result<()> {
-        let readings = self.ask(pixels, true, into.asked, planned)?;
-        into.asked += pixels.len();
+        let readings = self.ask(pixels, true, planned, into)?;
         into.readings.extend(pixels.iter().copied().zip(readings));
         Ok(())
     }
@@ -137,14 +145,13 @@ impl<'a> Questions<'a> {
     /// Asks at measured pixels, for the alignment. They are not told their measurement: the answer would only repeat it.
     pub(super) fn ask_anchors(
         &self,
-        measured: Vec<(usize, usize, f32)>,
+        measured: &[(usize, usize, f32)],
         planned: usize,
         into: &mut Answers,
     ) -> Result<()> {
         let pixels: Vec<(usize, usize)> = measured.iter().map(|m| (m.0, m.1)).collect();
-        let said = self.ask(&pixels, false, into.asked, planned)?;
-        into.asked += said.len();
-        for (anchor, reading) in measured.into_iter().zip(&said) {
+        let said = self.ask(&pixels, false, planned, into)?;
+        for (&anchor, reading) in measured.iter().zip(&said) {
             into.anchors.push(anchor, reading);
         }
         Ok(())
@@ -214,24 +221,35 @@ impl<'a> Questions<'a> {
         let heard = self.options.filter.is_some() && answers.spacing <= CLOSE && !asked.is_empty();
         let corners = if heard { &none } else { kept };
         let input = FillInput { width, height, rgb: self.rgb, asked: &asked, sparse: corners };
-        let mut filled = self.options.fill.fill(&input)?;
-        let outliers = expected_at(self.flagged, &filled.depth, width);
-        let insisted = if self.options.outliers == Outliers::Preserve { self.flagged } else { &[] };
-        let mut measured = vec![false; width * height];
-        if self.options.preserve == Preserve::Keep {
-            for (x, y, depth) in self.sparse.points().chain(insisted.iter().copied()) {
-                let i = y * width + x;
-                measured[i] = true;
-                filled.depth[i] = depth;
-                filled.confidence[i] = 1.0;
-                filled.expected_error[i] = 0.0;
-            }
-        }
-        leave_out(self.options, width, &measured, &mut filled);
-        let map =
-            DepthMap::new(width, height, filled.depth, filled.confidence, filled.expected_error, measured)?;
-        Ok((map, outliers))
+        let filled = self.options.fill.fill(&input)?;
+        finished(self.options, self.sparse, self.flagged, filled)
     }
+}
+
+/// The map of a frame that is filled: measurements are kept, and what is not wanted is left out. And what is expected at the flagged ones, which are
+/// kept where the caller insists.
+pub(super) fn finished(
+    options: &CompleteOptions,
+    sparse: &SparseDepth,
+    flagged: &[(usize, usize, f32)],
+    mut filled: Filled,
+) -> Result<(DepthMap, Vec<Outlier>)> {
+    let (width, height) = (sparse.width(), sparse.height());
+    let outliers = expected_at(flagged, &filled.depth, width);
+    let insisted = if options.outliers == Outliers::Preserve { flagged } else { &[] };
+    let mut measured = vec![false; width * height];
+    if options.preserve == Preserve::Keep {
+        for (x, y, depth) in sparse.points().chain(insisted.iter().copied()) {
+            let i = y * width + x;
+            measured[i] = true;
+            filled.depth[i] = depth;
+            filled.confidence[i] = 1.0;
+            filled.expected_error[i] = 0.0;
+        }
+    }
+    leave_out(options, width, &measured, &mut filled);
+    let map = DepthMap::new(width, height, filled.depth, filled.confidence, filled.expected_error, measured)?;
+    Ok((map, outliers))
 }
 
 /// What is said at a pixel.

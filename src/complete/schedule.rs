@@ -1,14 +1,18 @@
 //! In which order the pixels of a frame are asked, and when that ends.
 
+use super::adaptive::ROUNDS;
+use super::clock::Clock;
 use super::options::{Partial, Progress};
-use super::pace::{Clock, Seconds};
+use super::pace::Seconds;
 use super::questions::{Answers, Questions};
 use crate::error::Result;
 use crate::query::QueryPlan;
-use crate::query::plan::{Asked, coarse_to_fine, lattice, refine_pixels, stride_within};
+use crate::query::plan::{coarse_to_fine, lattice, stride_within};
 use crate::query::told::choose_evenly;
-use std::collections::{HashMap, HashSet};
-use std::time::Instant;
+use rand::SeedableRng;
+use rand::seq::SliceRandom;
+use rand_chacha::ChaCha8Rng;
+use std::collections::HashSet;
 
 /// Measurements asked for the alignment, at most; more are chosen spatially even.
 const ALIGN_POINTS: usize = 2048;
@@ -16,10 +20,16 @@ const ALIGN_POINTS: usize = 2048;
 const PREVIEW_CHUNK: usize = 4096;
 /// Pixels of the first lattice under a deadline: enough for a map of rooms.
 const COARSE: usize = 256;
+/// One in so many questions of a budget is asked on a lattice, before it is known where they say the most.
+const LATTICE_SHARE: usize = 5;
 /// Share of the time under a deadline after which the clock is looked at again.
 const TICK: f64 = 0.05;
-/// Questions asked between two looks at the clock, at least and at most.
-const CHUNK: (usize, usize) = (64, 2048);
+/// Questions asked between two looks at the clock: so many at most; at least so many, for small batches are slow, as far as they take no more
+/// than so many seconds; and so many before it is known what one takes.
+const MOST: usize = 2048;
+const LEAST: usize = 64;
+const QUICK: f64 = 0.004;
+const UNSEEN: usize = 4;
 /// The alignment takes at most this share of the questions under a deadline.
 const ALIGN_SHARE: usize = 4;
 
@@ -31,7 +41,7 @@ impl Questions<'_> {
             QueryPlan::Every => 1,
             QueryPlan::Stride(n) => n,
             QueryPlan::Budget(n) => {
-                stride_within(region.width, region.height, n.min(region.pixels()).div_ceil(2))
+                stride_within(region.width, region.height, n.min(region.pixels()).div_ceil(LATTICE_SHARE))
             }
             QueryPlan::Deadline(_) => match clock {
                 Some(clock) => return self.ask_until(clock, pace),
@@ -48,12 +58,10 @@ impl Questions<'_> {
         let planned = coarse.len() + budget + anchors.len();
         let mut answers = Answers { spacing: stride, ..Default::default() };
         // First, so that what is looked at meanwhile is aligned.
-        self.ask_anchors(anchors, planned, &mut answers)?;
+        self.ask_anchors(&anchors, planned, &mut answers)?;
         self.ask_lattice(coarse, planned, &mut answers)?;
         if budget > 0 {
-            let more = self.refinement(stride, &answers, budget);
-            let planned = answers.asked + more.len();
-            self.ask_lattice(more, planned, &mut answers)?;
+            self.ask_worst(budget, &mut answers)?;
         }
         Ok(answers)
     }
@@ -66,7 +74,7 @@ impl Questions<'_> {
         let anchors = self.chosen_anchors(wanted.len());
         let planned = wanted.len() + anchors.len();
         let mut answers = Answers { spacing: 1, ..Default::default() };
-        self.ask_anchors(anchors, planned, &mut answers)?;
+        self.ask_anchors(&anchors, planned, &mut answers)?;
         self.ask_plan(&wanted, planned, &mut answers)?;
         Ok(answers)
     }
@@ -122,104 +130,88 @@ impl Questions<'_> {
         (self.region().pixels() as f64 / pixels.max(1) as f64).sqrt().ceil() as usize
     }
 
-    /// Where the rest of a budget goes.
-    fn refinement(&self, stride: usize, answers: &Answers, budget: usize) -> Vec<(usize, usize)> {
-        let region = self.region();
-        let known: HashMap<(usize, usize), Asked> = (answers.readings.iter())
-            .map(|(p, r)| (*p, Asked { depth: r.value, expected_error: r.expected_error }))
-            .collect();
-        let corners: Vec<Asked> = (region.lattice(lattice, stride).into_iter())
-            .map(|p| match known.get(&p) {
-                Some(asked) => *asked,
-                // A measured pixel that was not asked is sure of its depth.
-                None => Asked { depth: self.sparse.get(p.0, p.1).unwrap_or(f32::NAN), expected_error: 0.0 },
-            })
-            .collect();
-        let wanted = |x, y| {
-            let pixel = region.place((x, y));
-            self.wanted(pixel) && !known.contains_key(&pixel)
-        };
-        let more = refine_pixels(region.width, region.height, stride, &corners, budget, wanted);
-        more.into_iter().map(|pixel| region.place(pixel)).collect()
+    /// Asks so many more pixels where they say the most.
+    fn ask_worst(&self, budget: usize, into: &mut Answers) -> Result<()> {
+        let planned = into.asked + budget;
+        let mut left = budget;
+        for rounds in (1..=ROUNDS).rev() {
+            let pixels = self.worst(into, left.div_ceil(rounds))?;
+            left -= pixels.len();
+            self.ask_lattice(pixels, planned, into)?;
+        }
+        // What lies outside of all triangles, and what is left of a budget for nearly all pixels.
+        let rest = if left > 0 { self.unasked(into, left) } else { Vec::new() };
+        self.ask_lattice(rest, planned, into)
     }
 
-    /// Asks as much as the time allows. A coarse lattice comes first, so that there is always a whole map; nothing is asked where not even
-    /// that fits.
+    /// Asks as much as the time allows: a coarse lattice comes first, so that there is a whole map soon.
     fn ask_until(&self, clock: Clock, pace: Seconds) -> Result<Answers> {
         let (width, height) = self.size();
-        let refine = pace.refine * (width * height) as f64;
+        let mut time = TimeLeft { clock, refining: pace.refining(width * height), answer: pace.answer };
         let region = self.region();
         let stride = stride_within(region.width, region.height, COARSE);
         let mut answers = Answers { spacing: stride, ..Default::default() };
-        let coarse = self.first_lattice(stride);
-        let late = clock.left() - refine < pace.answer.unwrap_or(0.0) * coarse.len() as f64;
-        if late || coarse.is_empty() {
+        let coarse = self.wanted_of(coarse_to_fine, stride);
+        if !self.ask_while(&mut time, &coarse, &mut answers)? || coarse.is_empty() {
+            answers.spacing = self.spacing_of(answers.readings.len()).max(stride);
             return Ok(answers);
         }
-        let mark = Instant::now();
-        self.ask_plan(&coarse, coarse.len(), &mut answers)?;
-        let mut seconds = mark.elapsed().as_secs_f64() / coarse.len() as f64;
-        self.look(&answers, answers.asked);
-        // Less than nothing becomes 0.
-        let fitting = |seconds: f64| clock.fits(refine, seconds) as usize;
         if self.options.align {
-            let mark = Instant::now();
-            let anchors = choose_evenly(self.sparse, ALIGN_POINTS.min(fitting(seconds) / ALIGN_SHARE), 0);
-            let asked = anchors.len();
-            self.ask_anchors(anchors, answers.asked + asked, &mut answers)?;
-            if asked >= CHUNK.0 {
-                seconds = mark.elapsed().as_secs_f64() / asked as f64;
-            }
+            let anchors = choose_evenly(self.sparse, ALIGN_POINTS.min(time.fits() / ALIGN_SHARE), 0);
+            let planned = answers.asked + anchors.len();
+            self.anchors_while(&mut time, anchors, planned, &mut answers)?;
         }
-        let all = fitting(seconds).min(self.all_wanted().saturating_sub(answers.readings.len()));
-        if all < CHUNK.0 {
-            return Ok(answers);
-        }
+        let all = time.fits().min(self.all_wanted().saturating_sub(answers.readings.len()));
         let fine = stride_within(region.width, region.height, all.div_ceil(2).max(COARSE)).min(stride);
         let asked: HashSet<(usize, usize)> = answers.readings.iter().map(|(pixel, _)| *pixel).collect();
         let mut pixels = self.wanted_of(coarse_to_fine, fine);
         pixels.retain(|pixel| !asked.contains(pixel));
-        if !self.ask_while(&clock, refine, &mut seconds, &pixels, &mut answers)? {
+        if !self.ask_while(&mut time, &pixels, &mut answers)? {
             answers.spacing = self.spacing_of(answers.readings.len());
             return Ok(answers);
         }
         answers.spacing = fine;
-        let more = self.refinement(fine, &answers, fitting(seconds));
-        self.ask_while(&clock, refine, &mut seconds, &more, &mut answers)?;
+        for rounds in (1..=ROUNDS).rev() {
+            let pixels = self.worst(&answers, time.fits().div_ceil(rounds))?;
+            if !self.ask_while(&mut time, &pixels, &mut answers)? {
+                return Ok(answers);
+            }
+        }
+        let rest = self.unasked(&answers, time.fits());
+        self.ask_while(&mut time, &rest, &mut answers)?;
         Ok(answers)
     }
 
-    /// Asks pixels until the time is over; whether all were asked. `seconds` for one answer follow what is seen.
+    /// Asks pixels until the time is over; whether all were asked.
     pub(super) fn ask_while(
         &self,
-        clock: &Clock,
-        refine: f64,
-        seconds: &mut f64,
+        time: &mut TimeLeft,
         pixels: &[(usize, usize)],
         into: &mut Answers,
     ) -> Result<bool> {
         let (planned, spacing) = (into.asked + pixels.len(), into.spacing);
-        let mut rest = pixels;
-        while !rest.is_empty() {
-            let fits = clock.fits(refine, *seconds);
-            let tick = (TICK * clock.all() / seconds.max(1e-9)) as usize;
-            let count = tick.clamp(CHUNK.0, CHUNK.1).min(rest.len());
-            if fits < count as f64 {
-                return Ok(false);
-            }
-            let (now, later) = rest.split_at(count);
-            let mark = Instant::now();
+        time.spend(pixels, into, |now, into| {
             self.ask_plan(now, planned, into)?;
-            *seconds = 0.5 * (*seconds + mark.elapsed().as_secs_f64() / count as f64);
-            rest = later;
             // In a frame that follows another one, what is carried comes last: there is no whole map before.
             if self.options.preview.is_some() && !into.follows {
                 into.spacing = self.spacing_of(into.readings.len());
                 self.look(into, planned);
                 into.spacing = spacing;
             }
-        }
-        Ok(true)
+            Ok(())
+        })
+    }
+
+    /// Asks measured pixels until the time is over, those of any moment spread over the frame.
+    pub(super) fn anchors_while(
+        &self,
+        time: &mut TimeLeft,
+        anchors: Vec<(usize, usize, f32)>,
+        planned: usize,
+        into: &mut Answers,
+    ) -> Result<()> {
+        time.spend(&shuffled(anchors, 0), into, |now, into| self.ask_anchors(now, planned, into))?;
+        Ok(())
     }
 
     /// Shows what there is.
@@ -229,4 +221,60 @@ impl Questions<'_> {
             preview(&Partial::new(Progress { answered: answers.asked, planned }, &map));
         }
     }
+}
+
+/// The time that questions may take.
+pub(super) struct TimeLeft<'a> {
+    pub(super) clock: Clock<'a>,
+    /// To keep for making a map of the answers, seconds.
+    pub(super) refining: f64,
+    /// What one answer takes, seconds; `None` before any was seen.
+    pub(super) answer: Option<f64>,
+}
+
+impl TimeLeft<'_> {
+    /// How many more answers fit; none while it is not known what one takes.
+    pub(super) fn fits(&self) -> usize {
+        // Less than nothing becomes 0.
+        self.answer.map_or(0, |answer| self.clock.fits(self.refining, answer) as usize)
+    }
+
+    /// How many of so many questions are asked next; 0 when the time is over.
+    fn next(&self, questions: usize) -> usize {
+        let Some(answer) = self.answer else {
+            let some = UNSEEN.min(questions);
+            return if self.clock.left() > self.refining { some } else { 0 };
+        };
+        let within = |seconds: f64| (seconds / answer.max(1e-9)) as usize;
+        let least = within(QUICK).clamp(1, LEAST);
+        let count = within(TICK * self.clock.all()).clamp(least, MOST).min(questions);
+        if self.fits() < count { 0 } else { count }
+    }
+
+    /// Has `ask` ask, a batch at a time, until the time is over; whether all were asked. What one answer takes follows what is seen.
+    fn spend<T>(
+        &mut self,
+        mut questions: &[T],
+        into: &mut Answers,
+        mut ask: impl FnMut(&[T], &mut Answers) -> Result<()>,
+    ) -> Result<bool> {
+        while !questions.is_empty() {
+            let (now, later) = questions.split_at(self.next(questions.len()));
+            if now.is_empty() {
+                return Ok(false);
+            }
+            let before = into.seconds;
+            ask(now, into)?;
+            let seen = (into.seconds - before) / now.len() as f64;
+            self.answer = Some(self.answer.map_or(seen, |answer| 0.5 * (answer + seen)));
+            questions = later;
+        }
+        Ok(true)
+    }
+}
+
+/// In an order that is the same for the same seed, in which those of any moment are spread.
+pub(super) fn shuffled<T>(mut items: Vec<T>, seed: usize) -> Vec<T> {
+    items.shuffle(&mut ChaCha8Rng::seed_from_u64(seed as u64));
+    items
 }

@@ -20,7 +20,6 @@ pub use camera::{Camera, Distortion, Intrinsics, Transform};
 pub use cloud::ProjectionReport;
 pub use hidden::Visibility;
 pub use map::{DepthMap, DepthParts, Saturation};
-pub(crate) use normals::check_camera;
 pub use normals::normals;
 pub use sampling::{SparsePattern, sample_points};
 pub use scale::DepthScale;

@@ -32,7 +32,7 @@ pub fn normals(map: &DepthMap, camera: &Camera, radius: usize) -> Result<Vec<[f3
     if !(1..=MAX_RADIUS).contains(&radius) {
         return Err(Error::argument("radius of normals", radius, format!("1 to {MAX_RADIUS} pixels")));
     }
-    check_camera(map, camera)?;
+    camera.require_size("camera", "the size of the map", (map.width(), map.height()))?;
     let surface = Surface::new(map, camera);
     let mut normals = vec![[f32::NAN; 3]; map.depth().len()];
     normals.par_chunks_mut(map.width()).enumerate().for_each_init(
@@ -45,15 +45,6 @@ pub fn normals(map: &DepthMap, camera: &Camera, radius: usize) -> Result<Vec<[f3
         },
     );
     Ok(normals)
-}
-
-/// Fails unless the camera has pictures of the map's size.
-pub(crate) fn check_camera(map: &DepthMap, camera: &Camera) -> Result<()> {
-    if (map.width(), map.height()) == (camera.width(), camera.height()) {
-        return Ok(());
-    }
-    let found = format!("pictures of {}x{}", camera.width(), camera.height());
-    Err(Error::argument("camera", found, format!("{}x{}, as the map", map.width(), map.height())))
 }
 
 /// A plane as inverse depth over the plane z = 1, in units of the inverse depth at a pixel: `here` at its ray, and the change per

@@ -6,6 +6,7 @@ use crate::error::{Error, Result};
 use crate::fusion::Normalise;
 use crate::kernels;
 use crate::query::prompt::Glimpse;
+use crate::vlm::qwen2_5::Interrupt;
 use crate::vlm::qwen2_5::crops::{Picture, joined};
 use crate::vlm::qwen2_5::grid::Grid;
 use crate::vlm::qwen2_5::preprocess::Pixels;
@@ -51,6 +52,17 @@ impl SdimModel {
     ) -> Result<Tensor> {
         let grids: Vec<Grid> = frames.iter().map(|p| p.grid).collect();
         self.vlm.vision.encode(&self.embed_patches(frames, scattered, normalise)?, &grids)
+    }
+
+    /// As [`SdimModel::encode`], unless it is interrupted.
+    pub(crate) fn encode_unless(
+        &self,
+        pixels: &Pixels,
+        scattered: &Tensor,
+        interrupt: Interrupt,
+    ) -> Result<Tensor> {
+        let embedded = self.embed_patches(&[pixels], scattered, Normalise::Running)?;
+        self.vlm.vision.encode_unless(&embedded, &[pixels.grid], interrupt)
     }
 
     /// E of Eq. 3a: embedded patches of frames of one size, `[frames * patches, hidden]`.

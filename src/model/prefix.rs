@@ -7,6 +7,7 @@ use crate::error::Result;
 use crate::kernels;
 use crate::query::prompt::FrameSpace;
 use crate::query::settings::PixelReference;
+use crate::vlm::qwen2_5::Interrupt;
 use crate::vlm::qwen2_5::cache::KvCache;
 use crate::vlm::qwen2_5::crops::Picture;
 use crate::vlm::qwen2_5::decoder::Keep;
@@ -42,14 +43,24 @@ impl SdimModel {
     /// [`SdimModel::preprocess`] gave for `rgb`.
     ///
     /// # Errors
-    /// [`crate::Error::Config`] if the frame is too small for the checkpoint's mark; [`crate::Error::Tensors`] on mismatched shapes.
-    pub fn encode_frame(&self, rgb: &RgbImage, pixels: &Pixels, scattered: &Tensor) -> Result<Encoded> {
+    /// [`crate::Error::Config`] if the frame is too small for the checkpoint's mark; [`crate::Error::Tensors`] on mismatched shapes;
+    /// [`crate::Error::Cancelled`] when interrupted.
+    pub fn encode_frame(
+        &self,
+        rgb: &RgbImage,
+        pixels: &Pixels,
+        scattered: &Tensor,
+        interrupt: Interrupt,
+    ) -> Result<Encoded> {
         match self.prompts.settings().pixel_reference {
             PixelReference::Marker(marker) => {
                 let frame = MarkedFrame::new(self, marker, rgb, pixels, scattered)?;
                 Ok(Encoded::PerQuery(Box::new(frame)))
             }
-            _ => Ok(Encoded::Once(kernels::in_pool(&self.device, || self.encode(pixels, scattered))?)),
+            _ => {
+                let encode = || self.encode_unless(pixels, scattered, interrupt);
+                Ok(Encoded::Once(kernels::in_pool(&self.device, encode)?))
+            }
         }
     }
 
@@ -59,18 +70,25 @@ impl SdimModel {
     /// As [`SdimModel::preprocess`] and [`SdimModel::encode_frame`].
     pub fn prefill_frame(&self, rgb: &RgbImage, sparse: &SparseDepth) -> Result<Prefix> {
         let (pixels, scattered) = self.preprocess(rgb, sparse)?;
-        let encoded = self.encode_frame(rgb, &pixels, &scattered)?;
-        self.prefill_encoded(&pixels, encoded, sparse)
+        let encoded = self.encode_frame(rgb, &pixels, &scattered, Interrupt::NEVER)?;
+        self.prefill_encoded(&pixels, encoded, sparse, Interrupt::NEVER)
     }
 
     /// Reads what all queries of an encoded frame share.
     ///
     /// # Errors
-    /// [`crate::Error::Tensors`] on mismatched shapes.
-    pub fn prefill_encoded(&self, pixels: &Pixels, encoded: Encoded, sparse: &SparseDepth) -> Result<Prefix> {
+    /// [`crate::Error::Tensors`] on mismatched shapes; [`crate::Error::Cancelled`] when interrupted.
+    pub fn prefill_encoded(
+        &self,
+        pixels: &Pixels,
+        encoded: Encoded,
+        sparse: &SparseDepth,
+        interrupt: Interrupt,
+    ) -> Result<Prefix> {
         let frame = match encoded {
             Encoded::Once(tokens) => {
-                return kernels::in_pool(&self.device, || self.prefill_prefix(pixels, &tokens, sparse));
+                let read = || self.prefill_unless(pixels, &tokens, sparse, interrupt);
+                return kernels::in_pool(&self.device, read);
             }
             Encoded::PerQuery(frame) => *frame,
         };
@@ -81,7 +99,7 @@ impl SdimModel {
         let mut cache = self.vlm.decoder.cache(1);
         if !shared.is_empty() {
             let embedded = self.vlm.decoder.embed(&shared.ids)?;
-            self.vlm.prefill(&embedded, &shared.positions, &mut cache, Keep::Nothing)?;
+            self.vlm.prefill_unless(&embedded, &shared.positions, &mut cache, Keep::Nothing, interrupt)?;
         }
         let image = self.picture(pixels)?;
         Ok(Prefix { cache, ids: shared.ids, space, image, marked: Some(frame.with_opening(opening)) })
@@ -97,13 +115,23 @@ impl SdimModel {
         image_tokens: &Tensor,
         sparse: &SparseDepth,
     ) -> Result<Prefix> {
+        self.prefill_unless(pixels, image_tokens, sparse, Interrupt::NEVER)
+    }
+
+    fn prefill_unless(
+        &self,
+        pixels: &Pixels,
+        image_tokens: &Tensor,
+        sparse: &SparseDepth,
+        interrupt: Interrupt,
+    ) -> Result<Prefix> {
         let resized = (pixels.resized.width() as usize, pixels.resized.height() as usize);
         let (tokens, space) = self.prompts.prefix(sparse, pixels.grid, resized, &self.vlm.config, 0)?;
         let image = self.picture(pixels)?;
         let embedded = self.vlm.embed_prompt(&tokens.ids, image_tokens)?;
         let embedded = self.add_glimpses(embedded, &[(&image, &tokens.glimpses)])?;
         let mut cache = self.vlm.decoder.cache(1);
-        self.vlm.prefill(&embedded, &tokens.positions, &mut cache, Keep::Nothing)?;
+        self.vlm.prefill_unless(&embedded, &tokens.positions, &mut cache, Keep::Nothing, interrupt)?;
         Ok(Prefix { cache, ids: tokens.ids, space, image, marked: None })
     }
 

@@ -11,11 +11,11 @@ pub enum QueryPlan {
     Every,
     /// A lattice: each N-th column and row.
     Stride(usize),
-    /// At most this many pixels (those of the alignment come on top): half of them on a lattice, then where neighbours
-    /// disagree or the answer is unsure.
+    /// At most this many pixels (those of the alignment come on top): a third of them on a lattice, then between measurements and answers that
+    /// disagree or are unsure, where the picture has an edge, and where nothing is near.
     Budget(usize),
     /// As many pixels as can be asked until so much time has passed since [`complete`](crate::DepthCompleter::complete) was called: first a coarse
-    /// lattice, then finer ones, then where neighbours disagree or the answer is unsure.
+    /// lattice, then finer ones, then as with a budget.
     Deadline(Duration),
 }
 
@@ -34,13 +34,27 @@ impl FromStr for QueryPlan {
             None if text == "every" => Some(Self::Every),
             Some(("stride", n)) => number(n).map(Self::Stride),
             Some(("budget", n)) => number(n).map(Self::Budget),
-            Some(("deadline", ms)) => number(ms).map(|ms| Self::Deadline(Duration::from_millis(ms as u64))),
+            Some(("deadline", ms)) => milliseconds(ms).map(Self::Deadline),
             _ => None,
         };
-        let expected =
-            "every, stride:N, budget:N or deadline:MS (milliseconds) with a whole number from 1 on";
+        let expected = "every, stride:N or budget:N with a whole number from 1 on, or deadline:MS with milliseconds above 0";
         plan.ok_or_else(|| Error::argument("plan", text, expected))
     }
+}
+
+/// Digits of a millisecond's fraction, down to nanoseconds.
+const FRACTION: usize = 6;
+
+/// Milliseconds above 0, with at most [`FRACTION`] digits behind a point.
+fn milliseconds(text: &str) -> Option<Duration> {
+    let (whole, fraction) = text.split_once('.').unwrap_or((text, "0"));
+    let digits = |s: &str| !s.is_empty() && s.bytes().all(|b| b.is_ascii_digit());
+    if !digits(whole) || !digits(fraction) || fraction.len() > FRACTION {
+        return None;
+    }
+    let nanos = format!("{fraction:0<FRACTION$}").parse().ok()?;
+    let time = Duration::from_millis(whole.parse().ok()?).checked_add(Duration::from_nanos(nanos))?;
+    (!time.is_zero()).then_some(time)
 }
 
 impl std::fmt::Display for QueryPlan {
@@ -49,7 +63,14 @@ impl std::fmt::Display for QueryPlan {
             Self::Every => write!(f, "every"),
             Self::Stride(n) => write!(f, "stride:{n}"),
             Self::Budget(n) => write!(f, "budget:{n}"),
-            Self::Deadline(time) => write!(f, "deadline:{}", time.as_millis()),
+            Self::Deadline(time) => {
+                let (whole, nanos) = (time.as_millis(), time.subsec_nanos() % 1_000_000);
+                write!(f, "deadline:{whole}")?;
+                match format!("{nanos:0FRACTION$}").trim_end_matches('0') {
+                    "" => Ok(()),
+                    fraction => write!(f, ".{fraction}"),
+                }
+            }
         }
     }
 }
@@ -90,85 +111,6 @@ pub fn stride_within(width: usize, height: usize, budget: usize) -> usize {
     stride
 }
 
-/// What one lattice pixel answered, for [`refine_pixels`].
-#[derive(Debug, Clone, Copy)]
-pub struct Asked {
-    /// Metres; NaN if unreadable.
-    pub depth: f32,
-    /// Expected absolute error, metres.
-    pub expected_error: f32,
-}
-
-/// Where to spend the rest of a budget: the lattice cells whose corners disagree most, relative to their depth, or are
-/// least sure. Each chosen cell gives its centre and its edge midpoints; when all cells have given theirs, each gives the rest of
-/// its pixels, in the same order. Only pixels that are `wanted` and not on the lattice are chosen: `budget` of them, or all
-/// if there are fewer.
-///
-/// A corner without a readable answer is as unsure as a corner can be: its depth may be off by all of it.
-pub fn refine_pixels(
-    width: usize,
-    height: usize,
-    stride: usize,
-    answers: &[Asked],
-    budget: usize,
-    wanted: impl Fn(usize, usize) -> bool,
-) -> Vec<(usize, usize)> {
-    let pixels = lattice(width, height, stride);
-    if stride < 2 || answers.len() != pixels.len() {
-        return Vec::new();
-    }
-    let cols = pixels.iter().take_while(|p| p.1 == pixels[0].1).count();
-    let rows = pixels.len() / cols;
-    let mut cells: Vec<(f32, usize, usize)> = Vec::with_capacity(pixels.len());
-    for r in 0..rows {
-        for c in 0..cols {
-            let corners = [(r, c), (r, c + 1), (r + 1, c), (r + 1, c + 1)];
-            let inside = corners.iter().filter(|(r, c)| *r < rows && *c < cols);
-            cells.push((doubt(inside.map(|(r, c)| &answers[r * cols + c])), r, c));
-        }
-    }
-    cells.sort_by(|a, b| b.0.total_cmp(&a.0));
-    let half = stride / 2;
-    let middle = cells.iter().flat_map(|&(_, r, c)| {
-        let (x, y) = pixels[r * cols + c];
-        [(x + half, y + half), (x + half, y), (x, y + half)]
-    });
-    let mut taken = vec![false; width * height];
-    pixels.iter().for_each(|&(x, y)| taken[y * width + x] = true);
-    let first = pixels[0];
-    let rest = cells.iter().flat_map(|&(_, r, c)| {
-        // The cells at the left and the upper border hold what lies before them.
-        let span = |at: usize, cell: usize, first: usize| {
-            if cell == 0 { 0..first + stride } else { at..at + stride }
-        };
-        let (x, y) = pixels[r * cols + c];
-        let columns = span(x, c, first.0);
-        span(y, r, first.1).flat_map(move |y| columns.clone().map(move |x| (x, y)))
-    });
-    let fresh = |&(x, y): &(usize, usize)| {
-        x < width && y < height && wanted(x, y) && !std::mem::replace(&mut taken[y * width + x], true)
-    };
-    middle.chain(rest).filter(fresh).take(budget).collect()
-}
-
-/// How much the corners of a cell disagree and doubt, relative to their depth.
-fn doubt<'a>(corners: impl Iterator<Item = &'a Asked>) -> f32 {
-    let (mut low, mut high, mut unsure, mut unreadable) = (f32::MAX, 0f32, 0f32, false);
-    for corner in corners {
-        if corner.depth.is_finite() {
-            (low, high) = (low.min(corner.depth), high.max(corner.depth));
-            unsure = unsure.max(corner.expected_error);
-        } else {
-            unreadable = true;
-        }
-    }
-    if unreadable {
-        unsure = if high > 0.0 { unsure.max(high) } else { 1.0 };
-    }
-    let apart = if low < high { high - low } else { 0.0 };
-    if high > 0.0 { (apart + unsure) / high } else { unsure }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -181,7 +123,22 @@ mod tests {
         let late = QueryPlan::Deadline(Duration::from_millis(200));
         assert_eq!("deadline:200".parse::<QueryPlan>().unwrap(), late);
         assert_eq!(late.to_string(), "deadline:200");
-        for bad in ["", "stride", "stride:0", "stride:x", "budget:-1", "deadline:0", "deadline:0.2", "all"] {
+        for (text, time) in [
+            ("deadline:0.2", Duration::from_micros(200)),
+            ("deadline:16.67", Duration::from_micros(16_670)),
+            ("deadline:0.000001", Duration::from_nanos(1)),
+            ("deadline:3000000", Duration::from_secs(3000)),
+        ] {
+            assert_eq!(text.parse::<QueryPlan>().unwrap(), QueryPlan::Deadline(time));
+            assert_eq!(QueryPlan::Deadline(time).to_string(), text, "what is told is what was asked for");
+        }
+        for bad in
+            ["", "stride", "stride:0", "stride:x", "budget:-1", "all", "deadline", "deadline:", "deadline:0"]
+        {
+            assert!(matches!(bad.parse::<QueryPlan>(), Err(Error::Argument { .. })), "{bad}");
+        }
+        for bad in ["0.0", ".5", "5.", "-5", "+5", "1e3", "0.0000001", "nan", "99999999999999999999"] {
+            let bad = format!("deadline:{bad}");
             assert!(matches!(bad.parse::<QueryPlan>(), Err(Error::Argument { .. })), "{bad}");
         }
     }
@@ -220,57 +177,6 @@ mod tests {
             }
             ordered.sort_by_key(|p| (p.1, p.0));
             assert_eq!(ordered, lattice(w, h, s), "each pixel once");
-        }
-    }
-
-    #[test]
-    fn refinement_goes_where_answers_disagree() {
-        let (w, h, s) = (16, 16, 4);
-        let n = lattice(w, h, s).len();
-        let answers: Vec<Asked> =
-            (0..n).map(|i| Asked { depth: if i % 4 < 2 { 1.0 } else { 3.0 }, expected_error: 0.0 }).collect();
-        let chosen = refine_pixels(w, h, s, &answers, 6, |_, _| true);
-        assert_eq!(chosen.len(), 6);
-        let asked = lattice(w, h, s);
-        assert!(chosen.iter().all(|p| !asked.contains(p)));
-        let between = asked[1].0..asked[2].0 + 1;
-        assert!(chosen.iter().all(|(x, _)| between.contains(x)), "{chosen:?}");
-    }
-    #[test]
-    fn cells_with_unreadable_corners_come_first() {
-        let (w, h, s) = (32, 32, 4);
-        let asked = lattice(w, h, s);
-        let unreadable = asked[3 * 8 + 5];
-        let answers: Vec<Asked> = (0..asked.len())
-            .map(|i| match asked[i] == unreadable {
-                true => Asked { depth: f32::NAN, expected_error: f32::NAN },
-                // A step and some doubt elsewhere.
-                false => Asked { depth: if i % 8 < 2 { 1.0 } else { 2.0 }, expected_error: 0.1 },
-            })
-            .collect();
-        // The four cells around it, three pixels each.
-        let chosen = refine_pixels(w, h, s, &answers, 12, |_, _| true);
-        let near = |a: usize, b: usize| a.abs_diff(b) <= s;
-        assert!(chosen.iter().all(|p| near(p.0, unreadable.0) && near(p.1, unreadable.1)), "{chosen:?}");
-        let silent = vec![Asked { depth: f32::NAN, expected_error: f32::NAN }; asked.len()];
-        assert_eq!(refine_pixels(w, h, s, &silent, 12, |_, _| true).len(), 12);
-    }
-
-    #[test]
-    fn a_budget_is_spent_on_wanted_pixels_alone_and_to_the_end() {
-        for (w, h, s) in [(37, 22, 3), (64, 48, 5), (9, 30, 8), (5, 5, 7), (40, 1, 2)] {
-            let asked = lattice(w, h, s);
-            let answers: Vec<Asked> = (0..asked.len())
-                .map(|i| Asked { depth: 1.0 + (i * 7 % 5) as f32, expected_error: 0.1 })
-                .collect();
-            let wanted = |x: usize, y: usize| !(x * 5 + y * 3).is_multiple_of(4);
-            let all = refine_pixels(w, h, s, &answers, usize::MAX, wanted);
-            let left = (0..w * h).map(|i| (i % w, i / w)).filter(|p| wanted(p.0, p.1) && !asked.contains(p));
-            let mut sorted = all.clone();
-            sorted.sort_by_key(|p| (p.1, p.0));
-            assert_eq!(sorted, left.collect::<Vec<_>>(), "{w}x{h}, {s}: each of them once");
-            let some = all.len() / 2;
-            assert_eq!(refine_pixels(w, h, s, &answers, some, wanted), all[..some]);
         }
     }
 }

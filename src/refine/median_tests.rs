@@ -152,3 +152,35 @@ fn unreadable_answers_and_measured_pixels_stay_and_bad_input_is_an_error() {
     }
     assert!(filter.apply(&input, &[], at(0)).is_ok_and(|out| out.is_empty()));
 }
+
+/// Read in a frame that the model saw as it is: windows are far narrower than answers lie apart.
+fn joined(asked: &[Answered], points: &[(usize, usize, f32)], spacing: usize) -> Vec<Answered> {
+    let rgb = RgbImage::new(SIZE.0 as u32, SIZE.1 as u32);
+    let sparse = SparseDepth::from_points(SIZE.0, SIZE.1, points).unwrap();
+    let input = FillInput { width: SIZE.0, height: SIZE.1, rgb: &rgb, asked, sparse: &sparse };
+    MedianFilter::default().apply(&input, &[], Sampling { spacing, pixel: 1.0 }).unwrap()
+}
+
+#[test]
+fn answers_far_apart_are_read_with_those_around_them() {
+    let mut asked = lattice(8, |_, _| 2.0);
+    let middle = asked.iter().position(|a| (a.x, a.y) == (32, 24)).unwrap();
+    asked[middle].depth = 2.1;
+    assert!(joined(&asked, &[], 8).iter().all(|a| a.depth == 2.0), "what is a little off is mended");
+    asked[middle].depth = 1.5;
+    assert_eq!(joined(&asked, &[], 8)[middle].depth, 1.5, "thin things stay");
+    let step = |x: usize, _: usize| if x < 30 { 1.5 } else { 4.0 };
+    let asked = lattice(8, step);
+    for (a, b) in asked.iter().zip(joined(&asked, &[(29, 20, 1.5), (31, 20, 4.0)], 8)) {
+        assert_eq!((a.x, a.y, a.depth), (b.x, b.y, b.depth), "steps stay");
+    }
+    let floor = |x: usize, y: usize| 1.0 / (0.2 + 0.004 * y as f32 + 0.001 * x as f32);
+    let asked = lattice(8, floor);
+    for (a, b) in asked.iter().zip(joined(&asked, &[], 8)) {
+        assert!((a.depth / b.depth).ln().abs() < 0.01, "({}, {}): {} became {}", a.x, a.y, a.depth, b.depth);
+    }
+    let unreadable = Answered { depth: f32::NAN, ..asked[0] };
+    assert!(joined(&[unreadable], &[], 8)[0].depth.is_nan());
+    let at_a_measurement = joined(&asked, &[(asked[9].x, asked[9].y, 3.0)], 8);
+    assert_eq!(at_a_measurement[9], asked[9], "what was told its measurement stays as it is");
+}

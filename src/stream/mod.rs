@@ -24,11 +24,14 @@ pub struct StreamOptions {
     /// After so many frames an answer that nothing has confirmed has half of its confidence and twice its expected error left. What is
     /// unsure is asked again, so that nothing lives for ever.
     pub half_life: f32,
+    /// So many frames in a row may be made of the last map and their measurements alone, without encoding, prefill and questions, where the last
+    /// map covers them and no measurement contradicts it; 0 to ask about each frame.
+    pub rest: usize,
 }
 
 impl Default for StreamOptions {
     fn default() -> Self {
-        Self { complete: CompleteOptions::default(), camera: None, half_life: 12.0 }
+        Self { complete: CompleteOptions::default(), camera: None, half_life: 12.0, rest: 1 }
     }
 }
 
@@ -50,14 +53,22 @@ impl StreamOptions {
         self.half_life = frames;
         self
     }
+
+    /// With so many frames in a row that may do without the model.
+    pub fn with_rest(mut self, frames: usize) -> Self {
+        self.rest = frames;
+        self
+    }
 }
 
 /// Completes frames that follow each other: the map of one frame, moved as the camera has moved, is what the next one is expected to be.
 ///
 /// Pixels are asked where nothing is expected (what comes into view), where a measurement, the picture or an answer contradicts, at depth edges,
 /// where the expectation is unsure or old, and on a coarse lattice everywhere, another one in each frame, as a check. Elsewhere what is expected
-/// stands for answers, beside the new ones, before alignment, filter and filling. The stages before the questions (encoding and prefill) are
-/// those of a single frame, and so is the first frame.
+/// stands for answers, beside the new ones, before alignment, filter and filling. The first frame is completed alone.
+///
+/// Encoding and prefill are those of a single frame, and no question saves them. A frame may do without them where the last map covers it and its
+/// measurements agree with that ([`StreamOptions::rest`]): it is the moved map, aligned to its measurements, and what is filled in it is asked about next.
 ///
 /// A stream holds one map and one small picture, whatever it has seen. The same frames give the same maps, deadlines excepted. It belongs to one
 /// thread at a time; streams on several threads share one model by clones of its [`DepthCompleter`].
@@ -78,8 +89,10 @@ pub struct Stream {
     completer: DepthCompleter,
     options: StreamOptions,
     last: Option<Last>,
-    /// Frames since the last one that was completed alone.
+    /// Frames that were asked about since the last one that was completed alone.
     turn: usize,
+    /// Frames since the last one that was asked about.
+    rested: usize,
 }
 
 /// What is kept of a frame.
@@ -98,7 +111,7 @@ impl Stream {
         if !(options.half_life.is_finite() && options.half_life > 0.0) {
             return Err(Error::argument("half_life", options.half_life, "a finite number of frames above 0"));
         }
-        Ok(Self { completer, options, last: None, turn: 0 })
+        Ok(Self { completer, options, last: None, turn: 0, rested: 0 })
     }
 
     /// Completes the next frame. `pose` is the camera's place and attitude in a fixed frame, metres: "camera to world", which takes points in the
@@ -128,11 +141,19 @@ impl Stream {
         }
         let blocks = Blocks::new(rgb);
         let prior = self.expected(&blocks, size, pose);
+        if let Some(prior) = prior.as_ref().filter(|_| self.rested < self.options.rest)
+            && let Some(done) = self.completer.carry(rgb, sparse, &self.options.complete, prior)?
+        {
+            self.rested += 1;
+            self.last = Some(Last { map: done.map.clone(), blocks, pose: pose.copied() });
+            return Ok(done);
+        }
         let done = self.completer.complete_after(rgb, sparse, &self.options.complete, prior.as_ref())?;
         // What is only interpolated is no map to go on from.
         if done.interpolated {
             return Ok(done);
         }
+        self.rested = 0;
         self.turn = if prior.is_some() { self.turn.wrapping_add(1) } else { 0 };
         self.last = Some(Last { map: done.map.clone(), blocks, pose: pose.copied() });
         Ok(done)
@@ -141,7 +162,7 @@ impl Stream {
     /// Forgets all frames: the next one is completed alone.
     pub fn reset(&mut self) {
         self.last = None;
-        self.turn = 0;
+        (self.turn, self.rested) = (0, 0);
     }
 
     /// Has the frames that follow stopped by this token; `None` for by nothing.

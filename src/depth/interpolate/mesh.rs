@@ -90,6 +90,7 @@ impl Mesh {
     }
 
     /// Owner of any position in the plane, found by walking from the nearest pixel's owner.
+    #[cfg(any(feature = "train", test))]
     pub(crate) fn locate(&self, position: [f64; 2]) -> Owner {
         let x = position[0].round().clamp(0.0, (self.width - 1) as f64) as usize;
         let y = position[1].round().clamp(0.0, (self.height - 1) as f64) as usize;
@@ -128,12 +129,14 @@ impl Mesh {
     }
 
     /// Some triangle with this site as a corner, or the first one (0 also when there is none).
+    #[cfg(any(feature = "train", test))]
     fn triangle_at(&self, site: usize) -> usize {
         // Only positions within half a pixel of the hull come here, so a search is cheaper than a table.
         self.triangles.iter().position(|t| t.contains(&(site as u32))).unwrap_or(0)
     }
 
     /// Walks towards a position through the edges it lies behind; `None` when it is outside the hull.
+    #[cfg(any(feature = "train", test))]
     fn walk(&self, position: [f64; 2], start: usize) -> Option<usize> {
         let mut triangle = start;
         // On a Delaunay mesh the walk visits no triangle twice; rounding could break that, so it is counted.

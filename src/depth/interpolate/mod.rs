@@ -166,6 +166,7 @@ impl Interpolator {
     /// The value at any position, in the unit of `values` (one per point, in the order of the points).
     ///
     /// NaN for a position that is not finite, and where the values needed are absent or NaN.
+    #[cfg(any(feature = "train", test))]
     pub(crate) fn at(&self, x: f32, y: f32, values: &[f32]) -> f32 {
         if !(x.is_finite() && y.is_finite()) {
             return f32::NAN;

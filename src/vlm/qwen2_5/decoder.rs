@@ -4,6 +4,7 @@
 
 use super::cache::KvCache;
 use super::config::TextConfig;
+use super::interrupt::Interrupt;
 use super::rope::{MRope, RopeLayout, RopeTable};
 use super::token_table::TokenTable;
 use crate::error::{Error, Result};
@@ -241,22 +242,24 @@ impl Decoder {
         context: Context,
         trace: Option<&mut Vec<Tensor>>,
     ) -> Result<Tensor> {
-        self.run(embedded, table, context, Keep::All, trace)
+        self.run(embedded, table, context, Keep::All, trace, Interrupt::NEVER)
     }
 
     /// As [`Decoder::forward`] without a trace; gives the rows that `keep` names and saves the others' work in the last
     /// layer.
     ///
     /// # Errors
-    /// As [`Decoder::forward`]; [`Error::Argument`] if rows are to be left out without a cache.
+    /// As [`Decoder::forward`]; [`Error::Argument`] if rows are to be left out without a cache; [`Error::Cancelled`] when interrupted, which
+    /// leaves the cache of no use.
     pub fn forward_keeping(
         &self,
         embedded: &Tensor,
         table: &RopeTable,
         context: Context,
         keep: Keep,
+        interrupt: Interrupt,
     ) -> Result<Tensor> {
-        self.run(embedded, table, context, keep, None)
+        self.run(embedded, table, context, keep, None, interrupt)
     }
 
     fn run(
@@ -266,6 +269,7 @@ impl Decoder {
         mut context: Context,
         keep: Keep,
         mut trace: Option<&mut Vec<Tensor>>,
+        interrupt: Interrupt,
     ) -> Result<Tensor> {
         let rows = embedded.dim(0)?;
         let layout = match &context {
@@ -282,6 +286,7 @@ impl Decoder {
         let x = kernels::in_pool(embedded.device(), || -> Result<Tensor> {
             let mut x = embedded.clone();
             for (i, layer) in self.layers.iter().enumerate() {
+                interrupt.check()?;
                 let kept = kept.as_ref().filter(|_| i + 1 == self.layers.len());
                 x = layer.forward(&x, table, &layout, kept, i, &mut context)?;
                 if let Some(t) = trace.as_deref_mut() {

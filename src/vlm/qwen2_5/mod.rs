@@ -8,6 +8,7 @@ pub mod config;
 pub mod crops;
 pub mod decoder;
 pub mod grid;
+mod interrupt;
 mod model;
 pub mod patch_embed;
 pub mod positions;
@@ -17,4 +18,5 @@ pub mod sequences;
 pub mod token_table;
 pub mod vision;
 
+pub use interrupt::Interrupt;
 pub use model::QwenVl;

@@ -4,6 +4,7 @@ use super::cache::KvCache;
 use super::config::VlmConfig;
 use super::decoder::{Context, Decoder, Keep};
 use super::grid::Grid;
+use super::interrupt::Interrupt;
 use super::rope::{Position, RopeLayout};
 use super::vision::VisionTower;
 use crate::error::{Error, Result};
@@ -85,8 +86,23 @@ impl QwenVl {
         cache: &mut KvCache,
         keep: Keep,
     ) -> Result<Tensor> {
+        self.prefill_unless(embedded, positions, cache, keep, Interrupt::NEVER)
+    }
+
+    /// As [`QwenVl::prefill`], unless it is interrupted, which leaves the cache of no use.
+    ///
+    /// # Errors
+    /// As [`QwenVl::prefill`]; [`Error::Cancelled`].
+    pub fn prefill_unless(
+        &self,
+        embedded: &Tensor,
+        positions: &[Position],
+        cache: &mut KvCache,
+        keep: Keep,
+        interrupt: Interrupt,
+    ) -> Result<Tensor> {
         let table = self.decoder.rope().table(positions, embedded.device())?;
         let context = Context::Cached { shared: None, own: cache };
-        self.decoder.forward_keeping(embedded, &table, context, keep)
+        self.decoder.forward_keeping(embedded, &table, context, keep, interrupt)
     }
 }

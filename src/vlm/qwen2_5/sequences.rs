@@ -2,6 +2,7 @@
 
 use super::cache::KvCache;
 use super::decoder::{Context, Decoder, Keep};
+use super::interrupt::Interrupt;
 use super::rope::Position;
 use crate::error::{Error, Result};
 use candle_core::Tensor;
@@ -92,5 +93,5 @@ fn pass(
 ) -> Result<Tensor> {
     let table = decoder.rope().table(positions, embedded.device())?;
     let context = Context::Cached { shared, own };
-    decoder.final_norm(&decoder.forward_keeping(embedded, &table, context, Keep::Last)?)
+    decoder.final_norm(&decoder.forward_keeping(embedded, &table, context, Keep::Last, Interrupt::NEVER)?)
 }

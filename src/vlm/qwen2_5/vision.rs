@@ -4,6 +4,7 @@
 
 use super::config::VisionConfig;
 use super::grid::{Grid, WindowOrder};
+use super::interrupt::Interrupt;
 use super::patch_embed::PatchEmbed;
 use super::rope;
 use super::rope::RopeTable;
@@ -153,7 +154,15 @@ impl VisionTower {
     /// # Errors
     /// [`crate::Error::Tensors`] if the rows are not those of the grids.
     pub fn encode(&self, embedded: &Tensor, grids: &[Grid]) -> Result<Tensor> {
-        self.run(embedded, grids, None)
+        self.encode_unless(embedded, grids, Interrupt::NEVER)
+    }
+
+    /// Like [`VisionTower::encode`], unless it is interrupted.
+    ///
+    /// # Errors
+    /// As [`VisionTower::encode`]; [`Error::Cancelled`].
+    pub fn encode_unless(&self, embedded: &Tensor, grids: &[Grid], interrupt: Interrupt) -> Result<Tensor> {
+        self.run(embedded, grids, None, interrupt)
     }
 
     /// Like [`VisionTower::encode`], keeping the intermediate results (for tests).
@@ -162,7 +171,7 @@ impl VisionTower {
     /// As [`VisionTower::encode`].
     pub fn encode_traced(&self, embedded: &Tensor, grids: &[Grid]) -> Result<(Tensor, VisionTrace)> {
         let mut trace = VisionTrace::default();
-        let out = self.run(embedded, grids, Some(&mut trace))?;
+        let out = self.run(embedded, grids, Some(&mut trace), Interrupt::NEVER)?;
         Ok((out, trace))
     }
 
@@ -176,11 +185,17 @@ impl VisionTower {
         Ok(Pass { order, patches, table })
     }
 
-    fn run(&self, embedded: &Tensor, grids: &[Grid], mut trace: Option<&mut VisionTrace>) -> Result<Tensor> {
+    fn run(
+        &self,
+        embedded: &Tensor,
+        grids: &[Grid],
+        mut trace: Option<&mut VisionTrace>,
+        interrupt: Interrupt,
+    ) -> Result<Tensor> {
         let pass = self.pass(grids, embedded.device())?;
         let x = pick(embedded, &pass.patches)?;
         let blocks = trace.as_deref_mut().map(|t| &mut t.blocks);
-        let x = self.blocks(x, 0..self.blocks.len(), &pass, blocks)?;
+        let x = self.blocks(x, 0..self.blocks.len(), &pass, blocks, interrupt)?;
         self.merge(&x, &pass.order, trace)
     }
 
@@ -191,9 +206,11 @@ impl VisionTower {
         range: Range<usize>,
         pass: &Pass,
         mut trace: Option<&mut Vec<Tensor>>,
+        interrupt: Interrupt,
     ) -> Result<Tensor> {
         let (windowed, full) = (self.layout(&pass.order.windows), self.layout(&pass.order.images));
         for i in range {
+            interrupt.check()?;
             let layout = if self.config.fullatt_block_indexes.contains(&i) { &full } else { &windowed };
             x = self.blocks[i].forward(&x, &pass.table, layout)?;
             if let Some(t) = trace.as_deref_mut() {
@@ -227,7 +244,8 @@ impl VisionTower {
     /// [`crate::Error::Tensors`] if the rows are not those of the grid.
     pub fn base(&self, embedded: Tensor, grid: Grid) -> Result<VisionBase> {
         let pass = self.pass(&[grid], embedded.device())?;
-        let local = self.blocks(pick(&embedded, &pass.patches)?, self.local_blocks(), &pass, None)?;
+        let local =
+            self.blocks(pick(&embedded, &pass.patches)?, self.local_blocks(), &pass, None, Interrupt::NEVER)?;
         Ok(VisionBase { grid, embedded, local })
     }
 
@@ -274,11 +292,15 @@ impl VisionTower {
             let index = Tensor::from_slice(&places, places.len(), device)?;
             let order = WindowOrder { index: Vec::new(), windows, images: Vec::new() };
             let some = Pass { order, patches: Vec::new(), table: one.table.select(&index)? };
-            local = Tensor::cat(&[&local, &self.blocks(x, self.local_blocks(), &some, None)?], 0)?;
+            local = Tensor::cat(
+                &[&local, &self.blocks(x, self.local_blocks(), &some, None, Interrupt::NEVER)?],
+                0,
+            )?;
         }
         let all = self.pass(&vec![base.grid; changes.len()], device)?;
         let x = pick(&local, &states)?;
-        let x = self.blocks(x, self.local_blocks().end..self.blocks.len(), &all, None)?;
+        let rest = self.local_blocks().end..self.blocks.len();
+        let x = self.blocks(x, rest, &all, None, Interrupt::NEVER)?;
         self.merge(&x, &all.order, None)
     }
 }
