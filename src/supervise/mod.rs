@@ -1,6 +1,8 @@
 //! Textual supervision (Sec. 3.4): training with the answer's tokens as labels. Feature `train`.
 
+mod adaptation;
 mod asked;
+mod base;
 pub(crate) mod batch;
 mod config;
 mod evaluate;
@@ -9,6 +11,7 @@ pub(crate) mod loss;
 mod measure;
 pub(crate) mod mix;
 mod optimiser;
+mod own;
 mod pass;
 pub(crate) mod recipe;
 pub(crate) mod records;
@@ -18,7 +21,10 @@ mod store;
 mod trainer;
 mod vocabulary;
 
+pub use adaptation::{Adaptation, hold_back};
+pub use base::Base;
 pub use config::TrainConfig;
 pub use evaluate::{HeldOut, evaluate};
 pub use optimiser::AdamW;
+pub use own::{OwnFrame, OwnFrames};
 pub use trainer::{StepReport, Trainer};
