@@ -1,11 +1,12 @@
 //! Renders RGB-D scenes into the folder layout that `evaluate --data` reads, or as a sheet to look at.
 //!
 //! `cargo run --release --example render -- --out DIR --count N [--recipe RECIPE] [--library DIR] [--seed S] [--width W]
-//! [--height H] [--points P | --rings R] [--sheet FILE]`
+//! [--height H] [--points P | --rings R | --rig SEED] [--sheet FILE]`
 //!
 //! Recipes: `procedural` (the default), `furnished` (rooms of the models in `--library`, see `scripts/furniture.sh`),
 //! `street-lidar` (streets from a car, to be measured with `--rings`) and `training` (what models are trained on: frames of
-//! `--mix` with the measurements that are told, bad ones among them).
+//! `--mix` with the measurements that are told, bad ones among them). `--rig SEED` is a camera and a sensor of that seed: their colours,
+//! noise and pattern in every frame, the clean depth as ground truth.
 
 mod sheet;
 
@@ -16,7 +17,7 @@ use rand_chacha::ChaCha8Rng;
 use sdim::depth::{io, sample_points};
 use sdim::internals::benchmarks::{DepthFile, write_frame};
 use sdim::internals::scenes::furnished::{Library, Split, furnished};
-use sdim::internals::scenes::{RgbdFrame, SpinningLidar, procedural, street};
+use sdim::internals::scenes::{RgbdFrame, Rig, SpinningLidar, procedural, street};
 use sdim::internals::supervise::{self, BatchConfig, SceneMix, Scenes, mix, told_and_asked, training_seed};
 use sdim::{DepthScale, SparseDepth};
 use std::path::PathBuf;
@@ -59,6 +60,9 @@ struct Args {
     /// Also write what a LiDAR of 16, 32 or 64 rings beside the camera measures.
     #[arg(long)]
     rings: Option<usize>,
+    /// Also write what the depth sensor of this seed measures, and the pictures as the camera beside it takes them.
+    #[arg(long, value_name = "SEED", conflicts_with_all = ["points", "rings"])]
+    rig: Option<u64>,
 }
 
 #[derive(Clone, Copy, PartialEq, ValueEnum)]
@@ -91,7 +95,12 @@ impl Args {
     /// A frame and its measurements.
     fn made(&self, library: Option<&Library>, seed: u64) -> anyhow::Result<(RgbdFrame, Option<SparseDepth>)> {
         if self.recipe != Recipe::Training {
-            let frame = self.frame(library, seed)?;
+            let mut frame = self.frame(library, seed)?;
+            if let Some(rig) = self.rig {
+                let (picture, measured) = Rig::draw(rig).take(&frame, seed)?;
+                frame.rgb = picture;
+                return Ok((frame, Some(measured)));
+            }
             let measured = self.measured(&frame, seed)?;
             return Ok((frame, measured));
         }
@@ -141,11 +150,18 @@ fn main() -> anyhow::Result<()> {
         }
         let Some(out) = &args.out else { continue };
         let name = format!("scene_{seed}");
-        write_frame(out, &name, &frame, DepthFile::Png(scale))?;
+        // A rig's noise would drown in the millimetres of a small scene.
+        let store = if args.rig.is_some() { DepthFile::Npy } else { DepthFile::Png(scale) };
+        write_frame(out, &name, &frame, store)?;
         if let Some(sparse) = measured {
-            let stored: Vec<u16> = sparse.as_slice().iter().map(|&d| scale.stored(d).0).collect();
             let dir = out.join("sparse");
             std::fs::create_dir_all(&dir)?;
+            if args.rig.is_some() {
+                let path = dir.join(format!("{name}.npy"));
+                io::write_npy(path, args.width, args.height, sparse.as_slice())?;
+                continue;
+            }
+            let stored: Vec<u16> = sparse.as_slice().iter().map(|&d| scale.stored(d).0).collect();
             io::write_png16(dir.join(format!("{name}.png")), args.width, args.height, &stored)?;
         }
     }

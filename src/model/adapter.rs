@@ -3,7 +3,8 @@
 //! `sdim.json` says how the model is asked (template, pixel reference, numbers, depth normalisation, format version),
 //! which fusion block it has and which layers carry LoRA; `sdim.safetensors` holds the fusion block (`sdim.fusion.*`), the
 //! second patch embedding (`sdim.patch_embed.*`), number tokens (`sdim.number_tokens.*`), and the factors `{layer}.lora_A.weight` and
-//! `{layer}.lora_B.weight`.
+//! `{layer}.lora_B.weight`. A tensor under the name of one of the base's own replaces that one: so a small checkpoint that was adapted as a
+//! whole is an adapter, too.
 
 use super::files::{SETTINGS, TENSORS};
 use super::parts::Parts;

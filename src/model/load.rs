@@ -7,6 +7,8 @@ use crate::error::Result;
 use crate::query::Settings;
 use crate::vlm::checkpoint::LoadOptions;
 use crate::vlm::checkpoint::weights::Weights;
+#[cfg(feature = "tiny")]
+use candle_core::Device;
 use std::path::Path;
 
 impl SdimModel {
@@ -44,14 +46,23 @@ impl SdimModel {
 /// [`crate::Error::Tensors`] if the device refuses the tensors; what an adapter can have wrong.
 #[cfg(feature = "tiny")]
 pub fn tiny(options: &LoadOptions) -> Result<SdimModel> {
-    let files = CheckpointFiles::from_bytes(
-        "sdim-tiny",
-        include_bytes!("../../assets/sdim-tiny/config.json"),
-        include_bytes!("../../assets/sdim-tiny/preprocessor_config.json"),
-        include_bytes!("../../assets/sdim-tiny/sdim.json"),
-        include_bytes!("../../assets/sdim-tiny/tokenizer.json"),
-    )?;
+    let [config, preprocessor, settings, tokenizer] = TINY.map(str::as_bytes);
+    let files = CheckpointFiles::from_bytes("sdim-tiny", config, preprocessor, settings, tokenizer)?;
+    SdimModel::assemble(files, tiny_weights(&options.device)?, options)
+}
+
+/// Its `config.json`, `preprocessor_config.json`, `sdim.json` and `tokenizer.json`.
+#[cfg(feature = "tiny")]
+pub(crate) const TINY: [&str; 4] = [
+    include_str!("../../assets/sdim-tiny/config.json"),
+    include_str!("../../assets/sdim-tiny/preprocessor_config.json"),
+    include_str!("../../assets/sdim-tiny/sdim.json"),
+    include_str!("../../assets/sdim-tiny/tokenizer.json"),
+];
+
+/// Its tensors.
+#[cfg(feature = "tiny")]
+pub(crate) fn tiny_weights(device: &Device) -> Result<Weights> {
     let bytes = include_bytes!("../../assets/sdim-tiny/model.safetensors");
-    let weights = Weights::from_bytes("sdim-tiny/model.safetensors", &bytes[..], &options.device)?;
-    SdimModel::assemble(files, weights, options)
+    Weights::from_bytes("sdim-tiny/model.safetensors", &bytes[..], device)
 }

@@ -28,6 +28,8 @@ pub use generate::FreeAnswer;
 pub use initial::initial;
 #[cfg(feature = "tiny")]
 pub use load::tiny;
+#[cfg(all(feature = "tiny", feature = "train"))]
+pub(crate) use load::{TINY, tiny_weights};
 pub use parts::DepthInjection;
 pub use prefix::{Encoded, Prefix};
 pub use sdim_model::SdimModel;

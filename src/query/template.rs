@@ -44,7 +44,7 @@ pub struct PromptTemplate {
     pub query: String,
     /// `{mask}` of a pixel without a measurement.
     pub mask_missing: String,
-    /// `{mask}` of a measured pixel, with `{x}`.
+    /// `{mask}` of a measured pixel, perhaps with `{x}`.
     pub mask_measured: String,
     /// The pixel in words, with `{col}` and `{row}` (pixels of the resized image), for `PixelReference::Coordinates`.
     pub coordinates: String,
@@ -131,7 +131,7 @@ impl PromptTemplate {
             need("template.coordinates", &self.coordinates, part, 1..=1)?;
         }
         if self.query.contains("{mask}") {
-            need("template.mask_measured", &self.mask_measured, "{x}", 1..=1)?;
+            need("template.mask_measured", &self.mask_measured, "{x}", 0..=1)?;
         }
         Ok(())
     }

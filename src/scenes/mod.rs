@@ -12,6 +12,7 @@ mod furniture;
 mod lidar;
 mod light;
 mod objects;
+mod rig;
 mod rooms;
 mod scene;
 pub mod sensor;
@@ -30,6 +31,7 @@ use rand_chacha::ChaCha8Rng;
 use crate::depth::Intrinsics;
 use crate::error::{Error, Result};
 pub use lidar::SpinningLidar;
+pub use rig::Rig;
 pub use scene::Scene;
 use stage::Stage;
 

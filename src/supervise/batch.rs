@@ -214,16 +214,33 @@ pub fn written(
     asked: &[(usize, usize, f32)],
     seed: u64,
 ) -> Result<Example> {
+    let side = asking.config.vision.patch_size;
+    let grid = Grid { height: rgb.height() as usize / side, width: rgb.width() as usize / side };
+    let pixels = Pixels { resized: rgb.clone(), grid };
+    written_on(asking, pixels, prompted, prompt_points, asked, seed)
+}
+
+/// As [`written`], about a frame of any size, of which `pixels` is what the encoder reads.
+///
+/// # Errors
+/// As [`written`].
+pub(super) fn written_on(
+    asking: Asking,
+    pixels: Pixels,
+    prompted: &SparseDepth,
+    prompt_points: usize,
+    asked: &[(usize, usize, f32)],
+    seed: u64,
+) -> Result<Example> {
     prompted.require_points()?;
-    let (width, height) = (rgb.width() as usize, rgb.height() as usize);
+    let (width, height) = (prompted.width(), prompted.height());
     if asked.is_empty() {
         return Err(Error::NoMeasurement { width, height });
     }
-    let vision = &asking.config.vision;
-    let grid = Grid { height: height / vision.patch_size, width: width / vision.patch_size };
+    let resized = (pixels.resized.width() as usize, pixels.resized.height() as usize);
     let writer = asking.prompts;
     let (prefix, space) =
-        writer.prefix_of(prompted, prompt_points, grid, (width, height), asking.config, seed)?;
+        writer.prefix_of(prompted, prompt_points, pixels.grid, resized, asking.config, seed)?;
 
     let points: Vec<(f32, f32)> = prompted.points().map(|(x, y, _)| (x as f32, y as f32)).collect();
     let values: Vec<f32> = prompted.points().map(|p| p.2).collect();
@@ -249,8 +266,7 @@ pub fn written(
         items.push(Item { tokens, supervised, answer, value, hint, scale });
     }
     items.sort_by_key(|i| i.tokens.len());
-    let scattered = scatter(prompted, width, height, |depth| writer.seen(depth, space.unit));
-    let pixels = Pixels { resized: rgb.clone(), grid };
+    let scattered = scatter(prompted, resized.0, resized.1, |depth| writer.seen(depth, space.unit));
     Ok(Example { pixels, scattered, unit: space.unit, prefix, items })
 }
 

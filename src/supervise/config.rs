@@ -29,6 +29,15 @@ pub struct TrainConfig {
     pub l1: f32,
     /// Share of the steps after which normalisations use their running statistics, as inference does.
     pub freeze_norm_at: f32,
+    /// By how much more the targets are blurred at the first step than at the end: near misses teach a fresh model. Falls to 0
+    /// over a quarter of the steps.
+    #[serde(default = "fresh")]
+    pub widen: f32,
+}
+
+/// [`TrainConfig::widen`] of a model that knows nothing.
+fn fresh() -> f32 {
+    7.0
 }
 
 impl Default for TrainConfig {
@@ -42,6 +51,7 @@ impl Default for TrainConfig {
             optimiser: AdamW::default(),
             l1: 4.0,
             freeze_norm_at: 0.5,
+            widen: fresh(),
         }
     }
 }
@@ -82,7 +92,7 @@ impl TrainConfig {
         if let Some((name, share)) = b.wrong_share() {
             return Err(Error::config(file, &format!("batch.{name}"), share.to_string(), "0 to 1"));
         }
-        let checks: [(&str, bool, String, &str); 15] = [
+        let checks: [(&str, bool, String, &str); 16] = [
             (
                 "batch.mix",
                 b.mix.check().is_ok(),
@@ -123,6 +133,7 @@ impl TrainConfig {
                 self.freeze_norm_at.to_string(),
                 "0 to 1, a share of the steps",
             ),
+            ("widen", self.widen.is_finite() && self.widen >= 0.0, self.widen.to_string(), "0 or more"),
         ];
         match checks.into_iter().find(|(_, good, ..)| !good) {
             Some((key, _, found, expected)) => Err(Error::config(file, key, found, expected)),

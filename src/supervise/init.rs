@@ -36,6 +36,13 @@ impl FreshFiles {
         Self::of(&Shape::tiny(), settings)
     }
 
+    /// Those of the checkpoint inside the crate.
+    #[cfg(feature = "tiny")]
+    pub(super) fn embedded() -> Self {
+        let [config, preprocessor, settings, tokenizer] = crate::model::TINY.map(String::from);
+        Self { config, preprocessor, settings, tokenizer }
+    }
+
     /// A model of any shape.
     ///
     /// # Errors

@@ -1,6 +1,8 @@
 //! Textual supervision (Sec. 3.4): training with the answer's tokens as labels. Feature `train`.
 
+mod adaptation;
 mod asked;
+mod base;
 pub(crate) mod batch;
 mod config;
 mod evaluate;
@@ -10,6 +12,7 @@ pub(crate) mod loss;
 mod measure;
 pub(crate) mod mix;
 mod optimiser;
+mod own;
 mod pass;
 pub(crate) mod prompts;
 pub(crate) mod recipe;
@@ -21,7 +24,10 @@ mod tensor_file;
 mod trainer;
 mod vocabulary;
 
+pub use adaptation::{Adaptation, hold_back};
+pub use base::Base;
 pub use config::TrainConfig;
 pub use evaluate::{HeldOut, evaluate};
 pub use optimiser::AdamW;
+pub use own::{OwnFrame, OwnFrames};
 pub use trainer::{StepReport, Trainer};

@@ -18,6 +18,7 @@ pub struct Parameter {
     pub average: Vec<f32>,
     values: Vec<f32>,
     decays: bool,
+    frozen: bool,
 }
 
 /// Settings of AdamW.
@@ -68,15 +69,28 @@ impl Parameters {
                 average: values.clone(),
                 values,
                 decays,
+                frozen: false,
             };
             all.insert(name, parameter);
         }
         Ok(Self { all })
     }
 
-    /// The tensors for building a model on them; a step changes them in place.
+    /// Trains tensors of these names alone. To be said before a model is built on [`Parameters::tensors`].
+    pub fn train_only(&mut self, trained: impl Fn(&str) -> bool) {
+        for (name, parameter) in &mut self.all {
+            parameter.frozen = !trained(name);
+        }
+    }
+
+    /// The tensors for building a model on them; a step changes those that are trained in place.
     pub fn tensors(&self) -> std::collections::HashMap<String, Tensor> {
-        self.all.iter().map(|(n, p)| (n.clone(), p.var.as_tensor().clone())).collect()
+        // Nothing is passed back through a tensor that is not tracked.
+        let tensor = |p: &Parameter| {
+            let tensor = p.var.as_tensor();
+            if p.frozen { tensor.detach() } else { tensor.clone() }
+        };
+        self.all.iter().map(|(n, p)| (n.clone(), tensor(p))).collect()
     }
 
     /// Copies of the moving averages.
@@ -97,6 +111,7 @@ impl Parameters {
         let mut square = 0f64;
         for parameter in self.all.values() {
             let grad: Option<Vec<f32>> = match grads.get(&parameter.var) {
+                Some(_) if parameter.frozen => None,
                 Some(g) => Some(g.flatten_all()?.to_vec1()?),
                 None => None,
             };
@@ -168,6 +183,11 @@ impl Gradients {
 impl Parameter {
     fn sync(&self) -> Result<()> {
         Ok(self.var.set(&Tensor::from_slice(&self.values, self.var.shape(), &Device::Cpu)?)?)
+    }
+
+    /// Whether it keeps its values.
+    pub fn frozen(&self) -> bool {
+        self.frozen
     }
 
     /// Current values.

@@ -91,13 +91,11 @@ pub fn save_state(dir: &Path, parameters: &Parameters, progress: Progress) -> Re
     write_tensors(&dir.join(STATE), &tensors)
 }
 
-/// Reads the weights of a published checkpoint (`model.safetensors`) as values and averages; moments stay as they are.
+/// Takes the weights of a checkpoint as values and averages; moments stay as they are.
 ///
 /// # Errors
-/// [`Error::Io`], [`Error::Format`] on a damaged file, [`Error::Tensor`] or [`Error::TensorSet`] if it belongs to another
-/// model.
-pub fn load_weights(dir: &Path, parameters: &mut Parameters) -> Result<()> {
-    let weights = Weights::from_dir(dir, &Device::Cpu)?;
+/// [`Error::Format`] on a damaged file, [`Error::Tensor`] or [`Error::TensorSet`] if they belong to another model.
+pub fn take_weights(weights: &Weights, parameters: &mut Parameters) -> Result<()> {
     let mut all = Vec::with_capacity(parameters.all.len());
     for (name, p) in &parameters.all {
         all.push(weights.get(name, p.var.dims())?.flatten_all()?.to_vec1::<f32>()?);

@@ -1,5 +1,6 @@
 //! The training loop.
 
+use super::base::Base;
 use super::batch::{self, Example};
 use super::config::{CONFIG, TrainConfig};
 use super::init::FreshFiles;
@@ -10,7 +11,7 @@ use super::store::{self, Progress};
 use crate::error::{Error, Result};
 use crate::fusion::{BatchStats, Normalise};
 use crate::kernels;
-use crate::model::{SETTINGS, SdimModel};
+use crate::model::{Adapter, SETTINGS, SdimModel};
 use crate::query::bins::Bins;
 use crate::query::number::POINT;
 use crate::query::{AnswerMode, PixelReference, Settings};
@@ -53,12 +54,17 @@ const BN_MOMENTUM: f32 = 0.05;
 /// Steps skipped in a row that end a run: it will not find back by itself.
 const SKIPPED_AT_MOST: usize = 20;
 
-/// Refuses settings of a model that would not come out as it is to be used; `file` is for messages.
-fn check_settings(settings: &Settings, file: &str) -> Result<()> {
+/// Refuses settings of a model whose batches cannot be made here; `file` is for messages.
+pub(super) fn check_shared(settings: &Settings, file: &str) -> Result<()> {
     if let PixelReference::Marker(_) = settings.pixel_reference {
         let expected = "a pixel reference that leaves the image as it is: batches share it between questions";
         return Err(Error::config(file, "pixel_reference.kind", "marker", expected));
     }
+    Ok(())
+}
+
+/// Refuses settings of a model that would not come out as it is to be used; `file` is for messages.
+fn check_settings(settings: &Settings, file: &str) -> Result<()> {
     if let AnswerMode::Generate(_) = settings.answer_mode {
         let expected = "digits: numbers are trained, not the words of a free answer";
         return Err(Error::config(file, "answer_mode.kind", "generate", expected));
@@ -70,6 +76,20 @@ fn check_settings(settings: &Settings, file: &str) -> Result<()> {
     Ok(())
 }
 
+/// Refuses frames that are rendered in a size that the model's patches do not fill; `dir` is for messages.
+fn check_sizes(config: &TrainConfig, files: &FreshFiles, dir: &Path) -> Result<()> {
+    let vision = files.parse_of(dir)?.config.vision;
+    let side = vision.patch_size * vision.merge_size;
+    match config.batch.sizes.iter().find(|s| s.0 % side != 0 || s.1 % side != 0) {
+        None => Ok(()),
+        Some(size) => {
+            let file = dir.join(CONFIG).display().to_string();
+            let expected = format!("sides that are multiples of {side} pixels");
+            Err(Error::config(&file, "batch.sizes", format!("{size:?}"), expected))
+        }
+    }
+}
+
 impl Trainer {
     /// A fresh tiny model.
     ///
@@ -77,8 +97,13 @@ impl Trainer {
     /// [`Error::Config`] names what is out of range in the configuration (as of `train.json`), or cannot be trained of the
     /// settings (as of `sdim.json`): a marker, free answers, LoRA.
     pub fn new(config: TrainConfig, settings: &Settings) -> Result<Self> {
+        let here = Path::new("");
+        check_shared(settings, SETTINGS)?;
         check_settings(settings, SETTINGS)?;
-        Self::start(config, FreshFiles::tiny(settings)?, Path::new(""))
+        let files = FreshFiles::tiny(settings)?;
+        check_sizes(&config, &files, here)?;
+        let parameters = Parameters::new(files.initial(config.seed)?)?;
+        Self::start(config, files, here, parameters)
     }
 
     /// Continues a run from the directory that [`Trainer::save`] wrote: with its configuration (`train.json`), its model's
@@ -87,24 +112,32 @@ impl Trainer {
     /// # Errors
     /// As [`TrainConfig::load`]; what the model's files and the state can have wrong, naming the file.
     pub fn resume(dir: &Path) -> Result<Self> {
-        let mut trainer = Self::start(TrainConfig::load(dir)?, FreshFiles::load(dir)?, dir)?;
+        let (config, files) = (TrainConfig::load(dir)?, FreshFiles::load(dir)?);
+        check_shared(&files.parse_of(dir)?.settings, &dir.join(SETTINGS).display().to_string())?;
+        check_sizes(&config, &files, dir)?;
+        let parameters = Parameters::new(files.initial(config.seed)?)?;
+        let mut trainer = Self::start(config, files, dir, parameters)?;
         trainer.progress = store::load_state(dir, &mut trainer.parameters)?;
         Ok(trainer)
     }
 
-    /// First weights of a model of these files; `dir` is where they are from, for messages.
-    fn start(config: TrainConfig, files: FreshFiles, dir: &Path) -> Result<Self> {
+    /// Goes on from a checkpoint of any shape, with its files, and trains the tensors of these names alone, on batches of the caller's
+    /// ([`Trainer::step_on`]).
+    ///
+    /// # Errors
+    /// As [`Trainer::new`] and [`Trainer::start_from`].
+    pub fn of(config: TrainConfig, base: &Base, trained: impl Fn(&str) -> bool) -> Result<Self> {
+        let mut parameters = Parameters::new(base.files.initial(config.seed)?)?;
+        base.fill(&mut parameters)?;
+        parameters.train_only(trained);
+        Self::start(config, base.files.clone(), &base.dir, parameters)
+    }
+
+    /// A run at its first step; `dir` is where the files are from, for messages.
+    fn start(config: TrainConfig, files: FreshFiles, dir: &Path, parameters: Parameters) -> Result<Self> {
         let place = |name: &str| dir.join(name).display().to_string();
         config.validate(&place(CONFIG))?;
-        let parsed = files.parse_of(dir)?;
-        check_settings(&parsed.settings, &place(SETTINGS))?;
-        let vision = &parsed.config.vision;
-        let side = vision.patch_size * vision.merge_size;
-        if let Some(size) = config.batch.sizes.iter().find(|s| s.0 % side != 0 || s.1 % side != 0) {
-            let expected = format!("sides that are multiples of {side} pixels");
-            return Err(Error::config(&place(CONFIG), "batch.sizes", format!("{size:?}"), expected));
-        }
-        let parameters = Parameters::new(files.initial(config.seed)?)?;
+        check_settings(&files.parse_of(dir)?.settings, &place(SETTINGS))?;
         let weights = Weights::from_tensors("training", parameters.tensors());
         let model = SdimModel::new(files.parse()?, &weights, &Device::Cpu)?;
         Ok(Self { config, files, parameters, model, progress: Progress::default(), prefetched: None })
@@ -116,7 +149,7 @@ impl Trainer {
     /// [`Error::Io`], [`Error::Format`] on a damaged file; [`Error::Tensor`] or [`Error::TensorSet`] if it belongs to another
     /// model.
     pub fn start_from(&mut self, dir: &Path) -> Result<()> {
-        store::load_weights(dir, &mut self.parameters)?;
+        store::take_weights(&Weights::from_dir(dir, &Device::Cpu)?, &mut self.parameters)?;
         (self.progress, self.prefetched) = (Progress::default(), None);
         Ok(())
     }
@@ -163,6 +196,25 @@ impl Trainer {
         SdimModel::new(self.files.parse()?, &weights, &Device::Cpu)?.fold()
     }
 
+    /// What became of a checkpoint: an adapter that holds, in f32, the averages that differ from its weights.
+    ///
+    /// # Errors
+    /// [`Error::Tensors`] if a tensor cannot be copied; as [`Trainer::of`] if this run is not of that checkpoint.
+    pub fn adapter(&self, base: &Base) -> Result<Adapter> {
+        let mut before = Parameters::new(base.files.initial(self.config.seed)?)?;
+        base.fill(&mut before)?;
+        let mut tensors = self.parameters.averages()?;
+        tensors.retain(|name, _| {
+            before.all.get(name).is_none_or(|p| p.values() != self.parameters.all[name].average)
+        });
+        Ok(Adapter { settings: self.files.parse()?.settings, tensors })
+    }
+
+    /// The model as it is trained.
+    pub fn model(&self) -> &SdimModel {
+        &self.model
+    }
+
     /// Steps done, those that were skipped included.
     pub fn step(&self) -> usize {
         self.progress.step
@@ -198,20 +250,37 @@ impl Trainer {
             Some((for_step, examples)) if for_step == step => examples,
             _ => self.make_batch(step)?,
         };
+        let (config, seed) = (self.config.batch.clone(), self.config.seed);
+        let next = |model: &SdimModel| batch::make(model, &config, seed, step + 1);
+        let (report, next) = self.step_on(&examples, next)?;
+        self.prefetched = Some((step + 1, next));
+        Ok(report)
+    }
+
+    /// One step on these examples, while `next` makes those of the step that follows. It is skipped if it would write numbers
+    /// that are not finite.
+    ///
+    /// # Errors
+    /// As [`Trainer::train_step`], and those of `next`.
+    pub fn step_on<T: Send>(
+        &mut self,
+        examples: &[Example],
+        next: impl FnOnce(&SdimModel) -> Result<T> + Send,
+    ) -> Result<(StepReport, T)> {
         let mut stats = Vec::new();
         let frozen = self.progress.step as f32 >= self.config.freeze_norm_at * self.config.steps as f32;
         // The next batch is rendered in the gaps of this one: much of a backward pass runs on one thread.
         let (passes, next) = kernels::join(
             &self.model.device,
             || -> Result<_> {
-                let parts = self.loss(&examples, if frozen { None } else { Some(&mut stats) })?;
+                let parts = self.loss(examples, if frozen { None } else { Some(&mut stats) })?;
                 let grads = parts.total.backward()?;
                 Ok((parts, grads))
             },
-            || self.make_batch(step + 1),
+            || next(&self.model),
         );
         let (parts, grads) = passes?;
-        self.prefetched = Some((step + 1, next?));
+        let next = next?;
         let loss = parts.total.to_scalar::<f32>()?;
         let rate = self.rate(self.progress.step);
         let gradients = self.parameters.gradients(&grads)?;
@@ -224,7 +293,8 @@ impl Trainer {
         } else {
             self.update(gradients, &stats, rate)?;
         }
-        Ok(StepReport { step: self.progress.step, loss, l1: parts.l1, gradient, rate, skipped })
+        let report = StepReport { step: self.progress.step, loss, l1: parts.l1, gradient, rate, skipped };
+        Ok((report, next))
     }
 
     fn skip(&mut self) -> Result<()> {
@@ -253,7 +323,8 @@ impl Trainer {
     fn update_statistics(&mut self, stats: &[BatchStats]) -> Result<()> {
         for s in stats {
             for (part, new) in [("running_mean", &s.mean), ("running_var", &s.var)] {
-                if let Some(p) = self.parameters.all.get_mut(&format!("{}.{part}", s.name)) {
+                let name = format!("{}.{part}", s.name);
+                if let Some(p) = self.parameters.all.get_mut(&name).filter(|p| !p.frozen()) {
                     let pairs = p.values().iter().zip(new);
                     let mixed: Vec<f32> = pairs.map(|(old, new)| old + BN_MOMENTUM * (new - old)).collect();
                     p.set(&mixed)?;
@@ -266,7 +337,7 @@ impl Trainer {
     /// Blur of the targets: wide at first, so that near misses teach, then narrow.
     fn bin_loss(&self, bins: Bins) -> BinLoss {
         let progress = self.progress.step as f32 / (0.25 * self.config.steps as f32).max(1.0);
-        let widen = 1.0 + 7.0 * (1.0 - progress).max(0.0);
+        let widen = 1.0 + self.config.widen * (1.0 - progress).max(0.0);
         BinLoss { bins, blur: 0.0015 * widen, blur_slope: 0.008 * widen, l1: self.config.l1 }
     }
 

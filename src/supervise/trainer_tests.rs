@@ -80,6 +80,33 @@ fn errors_are_counted_in_the_largest_measurement_or_in_medians() {
     }
 }
 
+#[test]
+fn what_is_not_trained_keeps_its_values_and_is_in_no_adapter() {
+    let files = FreshFiles::tiny(&Settings::tiny()).unwrap();
+    let initial = files.initial(5).unwrap();
+    let base = Base::of(files, initial.clone());
+    let decoder = |name: &str| name.starts_with("model.");
+    let mut trainer = Trainer::of(small(), &base, decoder).unwrap();
+    for _ in 0..2 {
+        assert!(!trainer.train_step().unwrap().skipped);
+    }
+    for (name, p) in &trainer.parameters.all {
+        assert_eq!(p.values() != values(&initial[name]), decoder(name), "{name}");
+    }
+    let adapter = trainer.adapter(&base).unwrap();
+    assert!(adapter.tensors.contains_key("model.norm.weight") && adapter.tensors.keys().all(|n| decoder(n)));
+}
+
+#[test]
+fn targets_of_a_model_that_knows_are_sharp_at_once() {
+    let width = |widen: f32| {
+        let trainer = Trainer::new(TrainConfig { widen, ..small() }, &Settings::tiny()).unwrap();
+        let bins = trainer.model.prompts.numbers().format.bins().unwrap();
+        trainer.bin_loss(bins).blur
+    };
+    assert_eq!(width(7.0), 8.0 * width(0.0));
+}
+
 /// Values, averages and both moments of all tensors.
 fn everything(trainer: &Trainer) -> Vec<[Vec<f32>; 4]> {
     let all = trainer.parameters.all.values();
