@@ -1,6 +1,9 @@
 """Fine-tuning of real-size models: what PyTorch answers is what `tests/finetune.rs` compares the crate with; streams, resuming, memory."""
 
 import json
+import os
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -158,3 +161,20 @@ def test_what_is_told_of_memory_is_the_sum_of_what_is_there():
     own = memory.bytes_of(model.sdim.parameters())
     assert eight["weights"] == memory.bytes_of(model.base.parameters()) // 8 + own
     assert memory.step(model, shapes.made_up(shapes.config("3b", 2), settings, (448, 336), 8, 4, 1))["activations"] > 2 * one["activations"]
+
+
+def test_two_ranks_tune_as_one_process(bases, start, tmp_path):
+    """FSDP on CPUs: the same frames in two halves. Statistics are those of the checkpoint, since each rank would measure its own half."""
+    given = ["--freeze-norm-at", "0", "--steps", "4", "--stop-at", "4"]
+
+    def arguments(out, batch):
+        launch = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", 2 // batch]
+        chosen = ["--base", bases["rows"], "--adapter", start("rows"), "--records", make.FIXTURE / "rows", "--out", tmp_path / out]
+        chosen += ["--batch", batch, "--rate", 1e-2, "--warmup", 1, "--precision", "f32", "--device", "cpu", *given]
+        return [str(a) for a in [*launch, "-m", "sdim_training.qwen.train", *chosen]]
+
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(make.ROOT / "training")}
+    for out, batch in (("one", 2), ("two", 1)):
+        subprocess.run(arguments(out, batch), check=True, env=environment, timeout=600)
+    one, two = (load_file(tmp_path / out / adapter.TENSORS) for out in ("one", "two"))
+    assert one.keys() == two.keys() and max(largest(one[k], two[k]) for k in one) < 1e-3
