@@ -74,7 +74,7 @@
 //! | `tiny` | yes | the embedded checkpoint: [`DepthCompleter`]`::tiny` |
 //! | `train` | no | what `examples/train.rs` and `examples/records.rs` are made of: scenes and the trainer; no public names yet |
 //! | `meshes` | no | the same with rooms furnished by OBJ models |
-//! | `benchmarks` | no | `benchmarks`: NYUv2, VOID, iBims-1, KITTI, DDAD, TUM, ScanNet, folders |
+//! | `benchmarks` | no | `benchmarks`: NYUv2, VOID, iBims-1, KITTI, DDAD, TUM, ScanNet, Hypersim, Virtual KITTI 2, folders |
 //! | `formats` | no | [`read_rgb`] reads WebP, BMP and TIFF too |
 //! | `tiff`, `exr` | no | [`SparseDepth::read`] reads TIFF, OpenEXR too |
 //! | `hub` | no | `hub`: checkpoints by name; the one feature that builds C |

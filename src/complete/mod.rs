@@ -36,7 +36,7 @@ use belief::{Reader, believe};
 use clock::Clock;
 use image::RgbImage;
 use pace::Pace;
-use questions::Questions;
+use questions::{Questions, scaled};
 use std::collections::HashMap;
 use std::path::Path;
 use std::sync::Arc;
@@ -267,8 +267,9 @@ impl DepthCompleter {
         let believed = believe(&reader, rgb, sparse, &mut StageSeconds::default())?;
         let questions = Questions::new(&self.model, rgb, &believed, &options, self.pace.watch())?;
         let answers = questions.ask_pixels(pixels)?;
-        let said: HashMap<(usize, usize), Answered> =
-            questions.aligned(&answers)?.into_iter().map(|a| ((a.x, a.y), a)).collect();
+        let mut aligned = questions.aligned(&answers)?;
+        aligned.iter_mut().for_each(|a| scaled(questions.scale(), a));
+        let said: HashMap<(usize, usize), Answered> = aligned.into_iter().map(|a| ((a.x, a.y), a)).collect();
         let insisted = options.preserve == Preserve::Keep && options.outliers == Outliers::Preserve;
         let kept: HashMap<(usize, usize), f32> =
             (believed.flagged.iter().filter(|_| insisted)).map(|&(x, y, depth)| ((x, y), depth)).collect();

@@ -54,7 +54,7 @@ const REACHES: f32 = 0.6;
 /// What such a neighbour weighs beside the answer itself, if it does not lie farther from it than this, in log depth: what is so far away from the
 /// answer is another surface, and thin things have no neighbour of their own.
 const JOINED: f32 = 0.35;
-const SAME: f32 = 0.14;
+const SAME: f32 = 0.07;
 
 /// Votes of one kind kept per square.
 const PER_SQUARE: usize = 2;
