@@ -140,8 +140,8 @@ pub use vlm::checkpoint::LoadOptions;
 pub mod settings {
     pub use crate::fusion::FusionConfig;
     pub use crate::query::{
-        AnswerMode, DepthUnit, Generation, Hint, Marker, MarkerShape, MeasurementPrompt, NumberFormat,
-        NumberTokens, PixelReference, PromptTemplate, Settings,
+        AnswerMode, ConfidenceScale, DepthUnit, Generation, Hint, Marker, MarkerShape, MeasurementPrompt,
+        NumberFormat, NumberTokens, PixelReference, PromptTemplate, Settings,
     };
     pub use crate::vlm::checkpoint::lora::{LoraConfig, LoraMode};
     pub use crate::vlm::qwen2_5::rope::RopeLayout;

@@ -3,8 +3,8 @@
 mod common;
 
 use common::program::program;
-use sdim::internals::query::ConfidenceScale;
 use sdim::internals::scenes::procedural;
+use sdim::settings::ConfidenceScale;
 use sdim::{CompleteOptions, DepthCompleter, DepthMap, LoadOptions, QueryPlan, Stream, StreamOptions};
 use serde_json::{Value, json};
 use std::path::Path;

@@ -1,8 +1,8 @@
 //! Pixels of many maps, with what was stated about them and what was true.
 
-use sdim::internals::query::ConfidenceScale;
 use sdim::internals::query::plan::lattice;
 use sdim::metrics::{Calibration, Sparsification, calibration, sparsification};
+use sdim::settings::ConfidenceScale;
 use sdim::{DepthMap, QueryPlan};
 use serde_json::json;
 

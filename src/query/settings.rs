@@ -226,7 +226,8 @@ impl Settings {
     }
 
     /// The same without what was found for one set of weights and says nothing of others: the scale of the confidence.
-    pub fn of_the_shape(&self) -> Self {
+    #[cfg(feature = "train")]
+    pub(crate) fn of_the_shape(&self) -> Self {
         Self { confidence: ConfidenceScale::default(), ..self.clone() }
     }
 
