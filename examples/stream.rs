@@ -230,7 +230,9 @@ fn main() -> anyhow::Result<()> {
         let ratio = |i: usize| stream[i] / single[i];
         let mib = |bytes: Option<u64>| bytes.map_or("unknown".into(), |b| format!("{} MiB", b >> 20));
         format!(
-            "{}{}{}{}ratio  {:6.2}          {:6.2}            {:.3}          {:.3}\n{rested} of {n} frames of the stream without a question\nmemory {} at most after a tenth of the frames, {} in the end; rendering took {rendering:.1} s",
+            "{}{}{}{}ratio  {:6.2}          {:6.2}            {:.3}          {:.3}\n\
+             {rested} of {n} frames of the stream without a question\n\
+             memory {} at most after a tenth of the frames, {} in the end; rendering took {rendering:.1} s",
             line("single", single),
             line("stream", stream),
             stages("single", &sums[0]),

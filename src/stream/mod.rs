@@ -67,8 +67,9 @@ impl StreamOptions {
 /// where the expectation is unsure or old, and on a coarse lattice everywhere, another one in each frame, as a check. Elsewhere what is expected
 /// stands for answers, beside the new ones, before alignment, filter and filling. The first frame is completed alone.
 ///
-/// Encoding and prefill are those of a single frame, and no question saves them. A frame may do without them where the last map covers it and its
-/// measurements agree with that ([`StreamOptions::rest`]): it is the moved map, aligned to its measurements, and what is filled in it is asked about next.
+/// Encoding and prefill are those of a single frame, and no question saves them. A frame may do without them where the last map covers it and
+/// its measurements agree with that ([`StreamOptions::rest`]): it is the moved map, aligned to its measurements, and what is filled in it is
+/// asked about next.
 ///
 /// A stream holds one map and one small picture, whatever it has seen. The same frames give the same maps, deadlines excepted. It belongs to one
 /// thread at a time; streams on several threads share one model by clones of its [`DepthCompleter`].
