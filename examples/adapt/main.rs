@@ -129,7 +129,7 @@ fn loaded(model: &str, adapter: Option<&Path>) -> anyhow::Result<DepthCompleter>
 /// Trains until the steps or the minutes are over, or nothing better comes.
 fn adapt(args: &Args, run: &mut Adaptation, held: &HeldOut, start: Instant) -> anyhow::Result<Outcome> {
     // More than a week is for ever; a duration cannot hold all numbers.
-    let limit = Duration::from_secs_f32(60.0 * args.minutes.max(0.0).min(1e4));
+    let limit = Duration::try_from_secs_f32((60.0 * args.minutes).clamp(0.0, 6e5)).unwrap_or_default();
     let style = "{wide_bar} step {pos}/{len} {elapsed} {msg}";
     let bar = ProgressBar::new(args.steps as u64).with_style(ProgressStyle::with_template(style)?);
     let (mut best, mut worse, mut since): (Option<Best>, usize, Vec<StepReport>) = (None, 0, Vec::new());
