@@ -12,7 +12,7 @@ mod sensors;
 
 use anyhow::Context;
 use clap::Parser;
-use common::{load_as, load_options, rounded, stdout};
+use common::{bundled, load_as, load_options, rounded, stdout};
 use indicatif::{ProgressBar, ProgressStyle};
 use sdim::calibration::Calibration;
 use sdim::depth::{Saturation, interpolate};
@@ -102,15 +102,12 @@ impl Args {
                 gt: self.gt.clone(),
                 scale: self.depth_scale,
             },
-            None => {
-                let bundled = |name| Path::new(env!("CARGO_MANIFEST_DIR")).join("assets/example").join(name);
-                Inputs {
-                    rgb: bundled("rgb.png"),
-                    sparse: Some(bundled("sparse.png")),
-                    gt: Some(bundled("gt.png")),
-                    scale: Some(DepthScale::millimetres()),
-                }
-            }
+            None => Inputs {
+                rgb: bundled("rgb.png"),
+                sparse: Some(bundled("sparse.png")),
+                gt: Some(bundled("gt.png")),
+                scale: Some(DepthScale::millimetres()),
+            },
         }
     }
 }

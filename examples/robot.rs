@@ -7,7 +7,7 @@ mod common;
 
 use anyhow::ensure;
 use clap::Parser;
-use common::{load_as, load_options, rounded, stdout};
+use common::{bundled, load_as, load_options, rounded, stdout};
 use sdim::cloud::{CloudOptions, PointCloud};
 use sdim::depth::{ProjectionReport, Visibility};
 use sdim::messages::{CameraInfo, Image, PointCloud2, PointField};
@@ -16,7 +16,6 @@ use sdim::{
     Transform, metrics, read_rgb,
 };
 use serde_json::json;
-use std::path::Path;
 use std::time::Instant;
 
 #[derive(Parser)]
@@ -66,10 +65,6 @@ fn answer(
     let sure = CloudOptions::default().with_min_confidence(min_confidence);
     let cloud = PointCloud2::from_cloud(&PointCloud::from_map(&map, Some(&rgb), &camera, &sure)?)?;
     Ok(Answer { cloud, depth: Image::from_depth(&map), projected })
-}
-
-fn bundled(name: &str) -> std::path::PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("assets/example").join(name)
 }
 
 /// The bundled frame as drivers publish such: the picture as bgr8 with padded rows, the calibration, the measurements as a cloud in the

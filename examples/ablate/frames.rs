@@ -1,6 +1,7 @@
 //! The frames that all cells share, and the questions about them.
 
 use crate::cells::Cell;
+use crate::common::HELD_OUT;
 use crate::run::Plan;
 use anyhow::Context;
 use rand::Rng;
@@ -25,8 +26,6 @@ const POINTS: usize = 150;
 const HELD_BACK: f64 = 0.3;
 /// Share of the questions that are about told measurements: the mask sentence has two kinds of pixels.
 const MEASURED: f64 = 0.25;
-/// Seeds from here on are never drawn in training.
-const HELD_OUT: u64 = 2_000_000;
 
 /// A frame with its measurements, which stay the same however often it is seen.
 pub struct Measured {

@@ -4,7 +4,7 @@
 pub mod stdout;
 
 use sdim::{DepthCompleter, LoadOptions, WeightFormat};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// What `--device`, `--weights` and `--adapter` say.
 pub fn load_options(
@@ -24,6 +24,14 @@ pub fn load_as(model: &str, options: &LoadOptions) -> anyhow::Result<DepthComple
         "tiny" => DepthCompleter::tiny_with(options)?,
         dir => DepthCompleter::load(dir, options)?,
     })
+}
+
+/// Seeds of scenes that are never drawn in training, from here on.
+pub const HELD_OUT: u64 = 2_000_000;
+
+/// A file of the bundled frame.
+pub fn bundled(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("assets/example").join(name)
 }
 
 /// Four decimals.

@@ -23,7 +23,7 @@ struct Curve<'a> {
 pub fn reliability(path: &Path, pools: &[(&str, &Pool)]) -> anyhow::Result<()> {
     let mut curves = Vec::new();
     for (name, pool) in pools {
-        let [(_, all), ..] = pool.parts();
+        let all = pool.reliability(|_| true);
         let points = all.iter().flat_map(|c| &c.bins).map(|b| (b.stated, b.observed)).collect();
         curves.push(Curve { name, points, marked: true });
     }

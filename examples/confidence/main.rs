@@ -71,11 +71,12 @@ type Source = Box<dyn Fn(usize) -> anyhow::Result<Frame>>;
 fn frames(args: &Args) -> anyhow::Result<(usize, Source)> {
     if let Some(dir) = &args.data {
         let data = args.layout.open(dir, &LayoutOptions::default())?;
+        let count = data.len();
         let load = move |i| {
             let sample = data.load(i)?;
             Ok(Frame { rgb: sample.rgb, truth: sample.gt, sparse: sample.sparse })
         };
-        return Ok((args.layout.open(dir, &LayoutOptions::default())?.len(), Box::new(load)));
+        return Ok((count, Box::new(load)));
     }
     let library = match &args.library {
         Some(dir) => Some(Library::open(dir)?.part(Split::HeldOut)?),

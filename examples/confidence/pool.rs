@@ -75,7 +75,8 @@ impl Pool {
         ]
     }
 
-    fn reliability(&self, wanted: impl Fn(bool) -> bool) -> Option<Calibration> {
+    /// Reliability of the confidence of pixels by whether they were asked.
+    pub fn reliability(&self, wanted: impl Fn(bool) -> bool) -> Option<Calibration> {
         let chosen: Vec<usize> = (0..self.len()).filter(|&i| wanted(self.asked[i])).collect();
         let stated: Vec<f64> = chosen.iter().map(|&i| self.confidence[i]).collect();
         let hit: Vec<f64> = chosen.iter().map(|&i| f64::from(u8::from(self.hit[i]))).collect();

@@ -10,7 +10,7 @@ mod shapes;
 
 use anyhow::{Context, ensure};
 use clap::Parser;
-use common::{load_as, load_options, rounded, stdout};
+use common::{bundled, load_as, load_options, rounded, stdout};
 use sdim::internals::model::{CheckpointFiles, SdimModel};
 use sdim::internals::vlm::checkpoint::weights::Weights;
 use sdim::{
@@ -100,9 +100,8 @@ struct Kept {
 
 impl Kept {
     fn measure(args: &Args, time: u64) -> anyhow::Result<Self> {
-        let bundled = Path::new(env!("CARGO_MANIFEST_DIR")).join("assets/example");
-        let depth = |file: &str| SparseDepth::read(bundled.join(file), Some(DepthScale::millimetres()));
-        let (rgb, sparse, gt) = (read_rgb(bundled.join("rgb.png"))?, depth("sparse.png")?, depth("gt.png")?);
+        let depth = |file: &str| SparseDepth::read(bundled(file), Some(DepthScale::millimetres()));
+        let (rgb, sparse, gt) = (read_rgb(bundled("rgb.png"))?, depth("sparse.png")?, depth("gt.png")?);
         let plan = QueryPlan::Deadline(Duration::from_millis(time));
         let options = CompleteOptions::default().with_plan(plan);
         let completer = args.load()?;

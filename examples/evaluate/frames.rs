@@ -1,15 +1,13 @@
 //! Where frames come from.
 
 use crate::Args;
+use crate::common::HELD_OUT;
 use crate::settings::Fnv;
 use anyhow::Context;
 use sdim::benchmarks::{Dataset, LayoutOptions, Sample};
 use sdim::internals::scenes::furnished::{Library, Split, furnished};
 use sdim::internals::scenes::{RgbdFrame, procedural};
 use std::path::Path;
-
-/// Seeds from here on are never drawn in training with the default configuration.
-const HELD_OUT: u64 = 2_000_000;
 
 /// Opens the data set that the arguments name.
 pub fn open(args: &Args) -> anyhow::Result<Box<dyn Dataset>> {

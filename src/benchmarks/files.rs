@@ -14,6 +14,19 @@ pub(super) const PICTURES: [&str; 3] = ["png", "jpg", "jpeg"];
 /// Files of a folder by the name without its ending, sorted.
 pub(super) type Listed = Vec<(String, PathBuf)>;
 
+/// All that a folder holds, files and folders, by name, sorted.
+pub(super) fn entries(dir: &Path) -> Result<Listed> {
+    let mut found = Vec::new();
+    for entry in fs::read_dir(dir).map_err(Error::io(dir))? {
+        let path = entry.map_err(Error::io(dir))?.path();
+        if let Some(name) = path.file_name().and_then(|n| n.to_str()) {
+            found.push((name.to_string(), path.clone()));
+        }
+    }
+    found.sort();
+    Ok(found)
+}
+
 /// Files of a folder with one of the endings. Two files of one name are an error.
 pub(super) fn list(dir: &Path, endings: &[&str]) -> Result<Listed> {
     let mut files = Vec::new();
@@ -94,14 +107,8 @@ pub(super) fn recordings(dir: &Path, marks: [&str; 2]) -> Result<Listed> {
     if whole(dir) {
         return Ok(vec![(String::new(), dir.to_path_buf())]);
     }
-    let mut found = Vec::new();
-    for entry in fs::read_dir(dir).map_err(Error::io(dir))? {
-        let path = entry.map_err(Error::io(dir))?.path();
-        if let (true, Some(name)) = (whole(&path), path.file_name().and_then(|n| n.to_str())) {
-            found.push((name.to_string(), path.clone()));
-        }
-    }
-    found.sort();
+    let mut found = entries(dir)?;
+    found.retain(|(_, path)| whole(path));
     let [one, other] = marks;
     if found.is_empty() {
         let expected = format!("{one} and {other}, or folders that hold them");

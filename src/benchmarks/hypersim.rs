@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use super::dataset::Sample;
-use super::files::{frame_name, list, list_some, picture, recordings, same_size, take, unpaired};
+use super::files::{entries, frame_name, list, list_some, picture, recordings, same_size, take, unpaired};
 use super::hdf5::Numbers;
 use super::listing::{Frame, Loader};
 use crate::depth::pixels::is_valid;
@@ -67,13 +67,8 @@ impl HypersimDataset {
 
 /// Names of the cameras of a scene, `scene_cam_00` and so on, those with distances.
 fn cameras(images: &Path) -> Result<Vec<String>> {
-    let mut found = Vec::new();
-    for entry in std::fs::read_dir(images).map_err(Error::io(images))? {
-        let name = entry.map_err(Error::io(images))?.file_name();
-        found.extend(name.to_str().and_then(|n| n.strip_suffix("_geometry_hdf5")).map(str::to_string));
-    }
-    found.sort();
-    Ok(found)
+    let camera = |(name, _): (String, PathBuf)| name.strip_suffix("_geometry_hdf5").map(str::to_string);
+    Ok(entries(images)?.into_iter().filter_map(camera).collect())
 }
 
 impl Loader for HypersimDataset {

@@ -1,11 +1,10 @@
 //! Virtual KITTI 2 (Cabon, Murray, Humenberger, 2020): rendered streets.
 
-use std::fs;
 use std::path::{Path, PathBuf};
 
 use super::dataset::Sample;
 use super::files::{
-    PICTURES, all_taken, frame_name, list, list_some, naming, picture, same_size, take, unpaired,
+    PICTURES, all_taken, entries, frame_name, list, list_some, naming, picture, same_size, take, unpaired,
 };
 use super::listing::{Frame, Loader};
 use crate::depth::io::png16;
@@ -80,15 +79,8 @@ fn camera_frames(name: &str, shown: &Path, gt: &Path) -> Result<Vec<Frame<Files>
 
 /// Names of the folders in a folder, sorted.
 fn folders(dir: &Path) -> Result<Vec<String>> {
-    let mut found = Vec::new();
-    for entry in fs::read_dir(dir).map_err(Error::io(dir))? {
-        let path = entry.map_err(Error::io(dir))?.path();
-        if path.is_dir() {
-            found.extend(path.file_name().and_then(|n| n.to_str()).map(str::to_string));
-        }
-    }
-    found.sort();
-    Ok(found)
+    let inside = entries(dir)?.into_iter().filter(|(_, path)| path.is_dir());
+    Ok(inside.map(|(name, _)| name).collect())
 }
 
 impl Loader for VirtualKittiDataset {

@@ -2,7 +2,7 @@
 
 use super::questions::{Answers, Questions};
 use crate::depth::interpolate::mesh::Mesh;
-use crate::depth::pixels::{is_valid, local_colour};
+use crate::depth::pixels::{colours_apart, is_valid, local_colour};
 use crate::error::Result;
 use crate::query::plan::coarse_to_fine;
 use rayon::prelude::*;
@@ -91,8 +91,7 @@ impl Questions<'_> {
         for corner in corners {
             (near, far) = (near.min(corner.depth), far.max(corner.depth));
             unsure = unsure.max(corner.error);
-            let squared: f32 = (0..3).map(|i| (colour[i] - corner.colour[i]).powi(2)).sum();
-            other = other.max(squared.sqrt() / 255.0);
+            other = other.max(colours_apart(colour, corner.colour).sqrt() / 255.0);
         }
         let apart = (far - near) / far;
         ((apart + UNSURE * unsure + COLOUR * other) * area.powf(GROWTH), middle)

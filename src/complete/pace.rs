@@ -64,6 +64,11 @@ fn mix(old: Option<f64>, new: f64) -> f64 {
     old.map_or(new, |old| 0.5 * (old + new))
 }
 
+/// What is known, if it is more than what was taken for granted.
+fn seen(known: f64, unseen: f64) -> Option<f64> {
+    (known != unseen).then_some(known)
+}
+
 impl Pace {
     #[cfg(test)]
     pub(super) fn by(watch: Watch) -> Self {
@@ -97,8 +102,7 @@ impl Pace {
     pub(super) fn interpolated(&self, pixels: usize, seconds: f64) {
         let new = seconds / pixels.max(1) as f64;
         self.change(|known| {
-            let seen = (known.interpolation != UNSEEN_INTERPOLATION).then_some(known.interpolation);
-            known.interpolation = mix(seen, new);
+            known.interpolation = mix(seen(known.interpolation, UNSEEN_INTERPOLATION), new);
         });
     }
 
@@ -111,8 +115,7 @@ impl Pace {
                 known.answer = Some(mix(known.answer, seconds / answers as f64));
             }
             if stages.refine > 0.0 {
-                let seen = (known.refine != UNSEEN_REFINE).then_some(known.refine);
-                known.refine = mix(seen, stages.refine / pixels);
+                known.refine = mix(seen(known.refine, UNSEEN_REFINE), stages.refine / pixels);
             }
         });
     }

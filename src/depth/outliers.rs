@@ -12,7 +12,7 @@
 use super::SparseDepth;
 use super::interpolate::mesh::Mesh;
 use super::interpolate::rim;
-use super::pixels::{is_valid, local_colour, median};
+use super::pixels::{colours_apart, is_valid, local_colour, median};
 use crate::error::{Error, Result};
 use image::RgbImage;
 use rayon::prelude::*;
@@ -290,10 +290,7 @@ impl<'a> Survey<'a> {
             }
         };
         let own = colour(pixel);
-        let apart = |&n: &usize| {
-            let other = colour(n);
-            (0..3).map(|c| (own[c] - other[c]).powi(2)).sum::<f32>()
-        };
+        let apart = |&n: &usize| colours_apart(own, colour(n));
         let least = around.iter().map(apart).fold(f32::INFINITY, f32::min);
         let most = if crowd { COLOUR_IN_A_CROWD } else { COLOUR };
         most * least.sqrt().min(OTHER_COLOUR) / OTHER_COLOUR

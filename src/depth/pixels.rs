@@ -79,6 +79,11 @@ pub(crate) fn local_colour(rgb: &RgbImage, x: usize, y: usize) -> [f32; 3] {
     std::array::from_fn(|c| 0.5 * own[c] + 0.125 * around.iter().map(|p| p[c]).sum::<f32>())
 }
 
+/// Squared distance of two colours.
+pub(crate) fn colours_apart(a: [f32; 3], b: [f32; 3]) -> f32 {
+    (0..3).map(|c| (a[c] - b[c]).powi(2)).sum()
+}
+
 /// The middle value, the upper one of two; `None` of nothing.
 pub(crate) fn median(values: &mut [f32]) -> Option<f32> {
     let middle = values.len() / 2;

@@ -24,12 +24,7 @@ pub struct Sparsification {
 ///
 /// `None` without pixels, for lists of different length, and for a value that is not finite or an error below 0.
 pub fn sparsification(errors: &[f64], uncertainty: &[f64]) -> Option<Sparsification> {
-    let usable =
-        errors.iter().all(|e| e.is_finite() && *e >= 0.0) && uncertainty.iter().all(|u| u.is_finite());
-    if errors.is_empty() || errors.len() != uncertainty.len() || !usable {
-        return None;
-    }
-    let mut pairs: Vec<(f64, f64)> = uncertainty.iter().copied().zip(errors.iter().copied()).collect();
+    let mut pairs = paired(errors, uncertainty)?;
     let (kept, mean) = (area(&mut pairs), pairs.iter().map(|p| p.1).sum::<f64>() / pairs.len() as f64);
     if mean == 0.0 {
         return Some(Sparsification { ause: 0.0, aurg: 0.0 });
@@ -39,14 +34,20 @@ pub fn sparsification(errors: &[f64], uncertainty: &[f64]) -> Option<Sparsificat
     Some(Sparsification { ause: area - oracle, aurg: 1.0 - area })
 }
 
+/// (uncertainty, error) of each pixel, if there are any and all can be judged.
+fn paired(errors: &[f64], uncertainty: &[f64]) -> Option<Vec<(f64, f64)>> {
+    let usable =
+        errors.iter().all(|e| e.is_finite() && *e >= 0.0) && uncertainty.iter().all(|u| u.is_finite());
+    let fit = usable && !errors.is_empty() && errors.len() == uncertainty.len();
+    fit.then(|| uncertainty.iter().copied().zip(errors.iter().copied()).collect())
+}
+
 /// The curve whose area [`sparsification`] judges: `(share, S)` at `steps + 1` shares of pixels removed, from 0 on and evenly apart, the most
 /// uncertain first. The last share leaves at least one pixel. `S` is the mean error of the pixels left, in units of that of all.
 ///
 /// `None` as [`sparsification`], for 0 steps, and with no error at all.
 pub fn sparsification_curve(errors: &[f64], uncertainty: &[f64], steps: usize) -> Option<Vec<(f64, f64)>> {
-    sparsification(errors, uncertainty).filter(|_| steps > 0)?;
-    let mut pairs: Vec<(f64, f64)> = uncertainty.iter().copied().zip(errors.iter().copied()).collect();
-    let means = kept_means(&mut pairs);
+    let means = kept_means(&mut paired(errors, uncertainty).filter(|_| steps > 0)?);
     let (n, all) = (means.len(), means.last().copied().filter(|mean| *mean > 0.0)?);
     let point = |step: usize| {
         let removed = (n * step / steps).min(n - 1);

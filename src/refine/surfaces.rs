@@ -6,7 +6,7 @@ use rayon::prelude::*;
 use super::fill::{FillInput, Filled};
 use crate::depth::interpolate::Plane;
 use crate::depth::interpolate::mesh::{Mesh, NONE, Owner};
-use crate::depth::pixels::local_colour;
+use crate::depth::pixels::{colours_apart, local_colour};
 use crate::error::Result;
 
 /// Linear within surfaces, and at a depth edge each pixel goes to the side whose colour and place it fits, never between.
@@ -203,8 +203,7 @@ impl<'a> Surfaces<'a> {
         let reach = sorted[candidates.len() / 2];
         let mut exponents = [f32::INFINITY; CANDIDATES];
         for ((exponent, &site), distance) in exponents.iter_mut().zip(candidates).zip(distances) {
-            let other = self.sites[site].colour;
-            let squared: f32 = (0..3).map(|i| (colour[i] - other[i]).powi(2)).sum();
+            let squared = colours_apart(colour, self.sites[site].colour);
             *exponent =
                 0.5 * squared / self.options.colour_sigma.powi(2) + (distance / reach.max(1.0)) as f32;
         }

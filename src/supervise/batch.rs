@@ -36,6 +36,18 @@ pub struct Example {
     pub items: Vec<Item>,
 }
 
+impl Example {
+    /// Pixels with a measurement, by their place in the frame, and what the fusion block sees of it.
+    pub(super) fn measured(&self) -> impl Iterator<Item = (u32, f32)> + '_ {
+        (0u32..).zip(self.scattered.iter().copied()).filter(|(_, value)| *value != 0.0)
+    }
+
+    /// What the frame's errors are counted in, as in its [`Item::scale`]; 1 without a question.
+    pub(super) fn scale(&self) -> f32 {
+        self.items.first().map_or(1.0, |item| item.scale)
+    }
+}
+
 /// One question with its answer.
 pub struct Item {
     /// What the decoder reads.

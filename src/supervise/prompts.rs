@@ -178,9 +178,9 @@ impl PromptShard {
         self.rgb.extend_from_slice(first.pixels.resized.as_raw());
         for example in variants {
             self.unit.push(example.unit);
-            self.scale.push(example.items.first().map_or(1.0, |i| i.scale));
-            for (i, &value) in example.scattered.iter().enumerate().filter(|(_, v)| **v != 0.0) {
-                self.measured_pixel.push(i as u32);
+            self.scale.push(example.scale());
+            for (pixel, value) in example.measured() {
+                self.measured_pixel.push(pixel);
                 self.measured_value.push(value);
             }
             self.measured_start.push(self.measured_pixel.len() as u32);

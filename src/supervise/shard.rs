@@ -146,9 +146,9 @@ impl Shard {
 
     fn push_variant(&mut self, example: &Example) -> Result<()> {
         self.unit.push(example.unit);
-        self.scale.push(example.items.first().map_or(1.0, |i| i.scale));
-        for (i, &value) in example.scattered.iter().enumerate().filter(|(_, v)| **v != 0.0) {
-            self.measured_pixel.push(i as u32);
+        self.scale.push(example.scale());
+        for (pixel, value) in example.measured() {
+            self.measured_pixel.push(pixel);
             self.measured_value.push(value);
         }
         self.measured_start.push(self.measured_pixel.len() as u32);

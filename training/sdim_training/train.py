@@ -337,8 +337,8 @@ def run(chosen, device, rank=0, world=1):
     return trainer
 
 
-def main():
-    chosen = options()
+def launched(run, chosen):
+    """Calls `run(chosen, device, rank, world)` as this process of `torchrun`, or of none."""
     world, rank = (int(os.environ.get(k, d)) for k, d in (("WORLD_SIZE", 1), ("RANK", 0)))
     device = torch.device(chosen.device or ("cuda" if torch.cuda.is_available() else "cpu"))
     if device.type == "cuda":
@@ -351,6 +351,10 @@ def main():
     finally:
         if world > 1:
             dist.destroy_process_group()
+
+
+def main():
+    launched(run, options())
 
 
 if __name__ == "__main__":

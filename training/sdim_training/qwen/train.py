@@ -11,11 +11,10 @@ from pathlib import Path
 
 import torch
 import torch._dynamo  # The optimiser loads it: here, so that it is there when memory is counted.
-import torch.distributed as dist
 from tqdm import tqdm
 
 from .. import report
-from ..train import BN_MOMENTUM, MOST_SKIPPED, Schedule
+from ..train import BN_MOMENTUM, MOST_SKIPPED, Schedule, launched
 from . import adapter, memory, parallel, shapes
 from .loss import NumberLoss
 from .model import QwenSdim
@@ -325,19 +324,7 @@ def run(chosen, device, rank=0, world=1):
 
 
 def main():
-    chosen = options()
-    world, rank = (int(os.environ.get(k, d)) for k, d in (("WORLD_SIZE", 1), ("RANK", 0)))
-    device = torch.device(chosen.device or ("cuda" if torch.cuda.is_available() else "cpu"))
-    if device.type == "cuda":
-        device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)))
-        torch.cuda.set_device(device)
-    if world > 1:
-        dist.init_process_group("cpu:gloo,cuda:nccl" if device.type == "cuda" else "gloo")
-    try:
-        run(chosen, device, rank, world)
-    finally:
-        if world > 1:
-            dist.destroy_process_group()
+    launched(run, options())
 
 
 if __name__ == "__main__":
