@@ -3,6 +3,7 @@
 use std::fs;
 use std::io::Read;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use crate::error::{Error, Result};
 use candle_core::Tensor;
@@ -57,13 +58,15 @@ pub(crate) fn write_tensors<'a>(
     write_whole(path, &bytes)
 }
 
-fn part_path(path: &Path) -> Result<PathBuf> {
+/// Where the bytes of a file stand until they are whole: a name that no other process and no other thread writes to.
+pub(crate) fn part_path(path: &Path) -> Result<PathBuf> {
+    static WRITTEN: AtomicU64 = AtomicU64::new(0);
     let Some(name) = path.file_name() else {
         return Err(Error::argument("path", path.display(), "a path that ends in a file name"));
     };
     let mut part = std::ffi::OsString::from(".");
     part.push(name);
-    part.push(format!(".{}.part", std::process::id()));
+    part.push(format!(".{}-{}.part", std::process::id(), WRITTEN.fetch_add(1, Ordering::Relaxed)));
     Ok(path.with_file_name(part))
 }
 
@@ -78,6 +81,24 @@ mod tests {
         write_whole(&path, b"first").unwrap();
         write_whole(&path, b"second").unwrap();
         assert_eq!(fs::read(&path).unwrap(), b"second");
+        assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 1);
+    }
+
+    /// With one name of the part for all threads, one would rename what another is still writing.
+    #[test]
+    fn threads_that_write_one_file_leave_one_of_their_contents() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.bin");
+        std::thread::scope(|scope| {
+            for byte in 0..4u8 {
+                let path = &path;
+                scope.spawn(move || {
+                    (0..50).for_each(|_| write_whole(path, &vec![byte; 1 << 16]).unwrap());
+                });
+            }
+        });
+        let left = fs::read(&path).unwrap();
+        assert!(left.len() == 1 << 16 && left.iter().all(|byte| *byte == left[0]));
         assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 1);
     }
 

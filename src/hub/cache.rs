@@ -10,7 +10,7 @@
 
 use super::names::is_commit;
 use crate::error::{Error, Result};
-use crate::files::write_whole;
+use crate::files::{part_path, write_whole};
 use std::fs::{self, File};
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
@@ -118,8 +118,9 @@ impl Repository {
     pub(super) fn link(&self, commit: &str, name: &str, etag: &str) -> Result<()> {
         let link = self.snapshot(commit).join(name);
         make_parent(&link)?;
-        let part = self.snapshot(commit).join(format!(".{name}.{}.part", std::process::id()));
+        let part = part_path(&link)?;
         let place = |part: &Path| {
+            // One that a process of the same number left there would be written through, into the content itself.
             let _ = fs::remove_file(part);
             if symlink(&Path::new("../../blobs").join(etag), part).is_err() {
                 // Where links are not to be had, the content stands in both places.

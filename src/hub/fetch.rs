@@ -90,11 +90,10 @@ impl Fetch<'_> {
 
     /// Puts a file of the listing into the snapshot.
     fn file(&self, dir: &Path, name: &str) -> Result<()> {
-        let listed = self.listing.files.get(name).copied().flatten();
-        let here = cache::size(&dir.join(name));
-        if here.is_some() && (listed.is_none() || here == listed) && is_whole(name, &dir.join(name))? {
+        if self.is_here(dir, name)? {
             return Ok(());
         }
+        let listed = self.listing.files.get(name).copied().flatten();
         let commit = &self.listing.commit;
         let facts = self.client.facts(commit, name).map_err(|refusal| self.refused(name, refusal))?;
         if facts.commit != *commit {
@@ -103,6 +102,10 @@ impl Fetch<'_> {
         }
         let facts = Facts { size: facts.size.or(listed), ..facts };
         let _lock = self.repository.lock(&facts.etag)?;
+        // Who held the lock may have put it in place, and others read it there by now.
+        if self.is_here(dir, name)? {
+            return Ok(());
+        }
         let blob = self.repository.blob(&facts.etag);
         let kept = cache::size(&blob);
         if kept.is_none() || (facts.size.is_some() && kept != facts.size) || !is_whole(name, &blob)? {
@@ -110,6 +113,13 @@ impl Fetch<'_> {
             self.content(name, &facts)?;
         }
         self.repository.link(commit, name, &facts.etag)
+    }
+
+    /// Whether the snapshot has this file as the repository lists it.
+    fn is_here(&self, dir: &Path, name: &str) -> Result<bool> {
+        let listed = self.listing.files.get(name).copied().flatten();
+        let here = cache::size(&dir.join(name));
+        Ok(here.is_some() && (listed.is_none() || here == listed) && is_whole(name, &dir.join(name))?)
     }
 
     /// Fetches content to where it is kept.

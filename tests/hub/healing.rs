@@ -129,3 +129,33 @@ fn two_that_fetch_at_once_share_the_work() {
     asked.sort();
     assert_eq!(asked, whole.keys().cloned().collect::<Vec<_>>());
 }
+
+/// Who waited for the lock finds the file in place, and does not put it there once more before the eyes of its readers.
+#[cfg(unix)]
+#[test]
+fn what_another_put_in_place_is_left_alone() {
+    use std::os::unix::fs::MetadataExt;
+    let (dir, whole) = (tempfile::tempdir().unwrap(), files());
+    let server = Server::new(COMMIT, &whole);
+    let locks = dir.path().join(".locks/models--somebody--some-model");
+    std::fs::create_dir_all(&locks).unwrap();
+    let lock = locks.join(format!("{}.lock", etag("model.safetensors", &whole["model.safetensors"])));
+    let lock = std::fs::File::create(lock).unwrap();
+    lock.lock().unwrap();
+    std::thread::scope(|scope| {
+        let waiting = scope.spawn(|| server.hub(dir.path()).checkpoint(REPOSITORY, None).unwrap());
+        // It asks for the content's name, and then for the lock.
+        let asked = |seen: &server::Seen| seen.method == "HEAD" && seen.path.ends_with("model.safetensors");
+        while !server.state.seen.lock().unwrap().iter().any(asked) {
+            std::thread::sleep(std::time::Duration::from_millis(5));
+        }
+        let weights = whole.iter().filter(|(name, _)| *name == "model.safetensors");
+        let weights = weights.map(|(name, bytes)| (name.clone(), bytes.clone())).collect();
+        let weights = cached(dir.path(), &weights).join("model.safetensors");
+        let place = || std::fs::symlink_metadata(&weights).unwrap().ino();
+        let before = place();
+        drop(lock);
+        assert_holds(&waiting.join().unwrap(), &whole);
+        assert_eq!(place(), before, "it was replaced");
+    });
+}
