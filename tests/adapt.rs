@@ -6,6 +6,7 @@ use common::program::program;
 use sdim::internals::benchmarks::{DepthFile, write_frame};
 use sdim::internals::scenes::{Rig, procedural};
 use sdim::internals::supervise::{Adaptation, Base, OwnFrame, OwnFrames};
+use sdim::settings::Settings;
 use sdim::{CompleteOptions, DepthCompleter, DepthMap, LoadOptions, QueryPlan, WeightFormat};
 use std::path::Path;
 use std::process::{Command, Output};
@@ -97,6 +98,36 @@ fn run(args: &[&str]) -> Output {
 
 fn text(path: &Path) -> &str {
     path.to_str().unwrap()
+}
+
+/// A model that has learnt nothing soon knows what a camera sees that always sees the same: what the program writes then is better at
+/// what was held back, and loads.
+#[test]
+fn what_is_better_is_written_and_loads() {
+    let dir = tempfile::tempdir().unwrap();
+    let [data, base, out] = ["data", "base", "out"].map(|name| dir.path().join(name));
+    write_frames(&data, 8);
+    for (part, ending) in [("rgb", "png"), ("sparse", "npy")] {
+        let frame = |i: u64| data.join(format!("{part}/{i}.{ending}"));
+        (0..8).filter(|i| *i != 3).for_each(|i| drop(std::fs::copy(frame(3), frame(i)).unwrap()));
+    }
+    let files = common::tiny::small_files(&Settings::tiny());
+    std::fs::create_dir(&base).unwrap();
+    common::tiny::write(&base, &files, &common::tiny::tensors(&files, 3));
+    let flags =
+        ["--data", text(&data), "--out", text(&out), "--model", text(&base), "--rate", "3e-3", "--json"];
+    let done = run(&[&flags[..], &["--steps", "45", "--frames", "2", "--check-every", "15"]].concat());
+    let said = String::from_utf8_lossy(&done.stdout).into_owned();
+    assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+    let told: serde_json::Value = serde_json::from_str(&said).unwrap();
+    assert_eq!(told["written"], text(&out), "{said}");
+    assert!(told["ratio"].as_f64().unwrap() < 0.6 && told["steps"] == 45, "{said}");
+    let frames = OwnFrames::read(&data, None).unwrap().frames;
+    let load = |options: LoadOptions| DepthCompleter::load(&base, &options).unwrap();
+    let [before, after] = [load(f32_options()), load(f32_options().with_adapter(&out))];
+    assert_ne!(completed(&before, &frames[0]).depth(), completed(&after, &frames[0]).depth());
+    let left: Vec<_> = std::fs::read_dir(dir.path()).unwrap().map(|e| e.unwrap().file_name()).collect();
+    assert_eq!(left.len(), 3, "nothing half-written: {left:?}");
 }
 
 #[test]
