@@ -44,11 +44,17 @@ struct Args {
     /// Steps on pictures alone, before all cells.
     #[arg(long, default_value_t = Plan::default().first_steps)]
     first_steps: usize,
+    /// Frames of a step.
+    #[arg(long, default_value_t = Plan::default().batch)]
+    batch: usize,
+    /// Peak learning rate of a cell.
+    #[arg(long, default_value_t = Plan::default().rates[1])]
+    rate: f32,
     /// Threads; more than one makes no other result.
     #[arg(long, default_value_t = 1)]
     threads: usize,
     /// Next to no work, to see that all of it runs; its numbers say nothing.
-    #[arg(long, conflicts_with_all = ["steps", "first_steps"])]
+    #[arg(long, conflicts_with_all = ["steps", "first_steps", "batch", "rate"])]
     quick: bool,
 }
 
@@ -56,7 +62,11 @@ impl Args {
     fn plan(&self) -> Plan {
         match self.quick {
             true => Plan::quick(),
-            false => Plan { steps: self.steps, first_steps: self.first_steps, ..Plan::default() },
+            false => {
+                let Self { steps, first_steps, batch, .. } = *self;
+                let rates = [Plan::default().rates[0], self.rate];
+                Plan { steps, first_steps, batch, rates, ..Plan::default() }
+            }
         }
     }
 

@@ -38,7 +38,7 @@ struct Args {
     #[arg(long)]
     out: PathBuf,
     /// Steps, at most.
-    #[arg(long, default_value_t = 120)]
+    #[arg(long, default_value_t = 400)]
     steps: usize,
     /// Minutes, at most; a run that they end depends on how fast the machine is.
     #[arg(long, default_value_t = 10.0)]
