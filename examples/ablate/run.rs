@@ -40,14 +40,14 @@ pub struct Plan {
 impl Default for Plan {
     fn default() -> Self {
         Self {
-            first_steps: 400,
-            steps: 150,
+            first_steps: 1500,
+            steps: 600,
             batch: 8,
             questions: 32,
             frames: 1024,
             tests: 64,
             questions_of_tests: 32,
-            rates: [1.5e-3, 1e-3],
+            rates: [1.5e-3, 3e-3],
         }
     }
 }
