@@ -4,7 +4,8 @@ mod common;
 
 use common::program::program;
 use sdim::depth::{interpolate, sample_points};
-use sdim::internals::scenes::glazed;
+use sdim::internals::scenes::sensor::DepthSensor;
+use sdim::internals::scenes::{Rig, glazed};
 use serde_json::Value;
 use std::path::Path;
 use std::process::{Command, Output};
@@ -75,4 +76,13 @@ fn render_shows_panes_and_measures_through_them() {
     assert!(sparse.points().all(|(x, y, d)| near(d, frame.sensed()[y * 64 + x])));
     assert!(truth.points().all(|(x, y, d)| near(d, frame.depth[y * 64 + x])));
     assert!(sparse.points().any(|(x, y, d)| truth.get(x, y).is_some_and(|t| d > 1.2 * t)));
+}
+
+#[test]
+fn a_cameras_own_sensor_sees_through_panes() {
+    let frame = glazed(3, 64, 48).unwrap();
+    let rig = Rig { sensor: DepthSensor::default(), ..Rig::draw(1) };
+    let (_, measured) = rig.take(&frame, 1).unwrap();
+    assert!(measured.points().all(|(x, y, d)| d == frame.sensed()[y * 64 + x]));
+    assert!(measured.points().any(|(x, y, d)| d > 1.05 * frame.depth[y * 64 + x]));
 }

@@ -106,14 +106,18 @@ impl Scores {
         Some([mean.value, mean.low, mean.high])
     }
 
-    fn numbers(&self, linear: &Self) -> Value {
+    /// Beside those of `linear` and of the first checkpoint, which are the first of `all`.
+    fn numbers(&self, all: &[Self]) -> Value {
+        let (linear, first) = (&all[0], all.get(1).unwrap_or(&all[0]));
         json!({
             "method": self.name,
             "frames": self.frames.len(),
             "pane_mae": self.mean(|f| f.pane),
             "pane_by_linear": self.ratio(linear, |f| f.pane),
+            "pane_by_first": self.ratio(first, |f| f.pane),
             "elsewhere_mae": self.mean(|f| f.elsewhere),
             "elsewhere_by_linear": self.ratio(linear, |f| f.elsewhere),
+            "elsewhere_by_first": self.ratio(first, |f| f.elsewhere),
             "sees_the_pane": self.mean(|f| f.near),
             "sees_the_pane_where_measured_through": self.mean(|f| f.near_measured),
             "flagged_of_measured_through": self.mean(|f| f.flagged),
@@ -130,7 +134,7 @@ pub fn json(report: &Report) -> anyhow::Result<String> {
     let all: Vec<Value> = report
         .iter()
         .map(|(points, scores)| {
-            let methods: Vec<Value> = scores.iter().map(|s| s.numbers(&scores[0])).collect();
+            let methods: Vec<Value> = scores.iter().map(|s| s.numbers(scores)).collect();
             json!({ "points": points, "methods": methods })
         })
         .collect();
@@ -144,13 +148,14 @@ pub fn tables(report: &Report) -> String {
         lines.push(format!("{points} points, {} scenes", scores.first().map_or(0, |s| s.frames.len())));
         lines.push(String::new());
         lines.push(
-            "| method | pane MAE m | by linear's | elsewhere MAE m | by linear's | sees the pane | there, where measured \
-             through it | not believed, of measurements through panes | of the others |"
+            "| method | pane MAE m | by linear's | by the first checkpoint's | elsewhere MAE m | by linear's | by the first \
+             checkpoint's | sees the pane | there, where measured through it | not believed, of measurements through panes | of the \
+             others |"
                 .into(),
         );
-        lines.push("|---|---|---|---|---|---|---|---|---|".into());
+        lines.push("|---|---|---|---|---|---|---|---|---|---|---|".into());
         for s in scores {
-            let v = s.numbers(&scores[0]);
+            let v = s.numbers(scores);
             let metres = |key: &str| v[key].as_f64().map_or("-".into(), |x| format!("{x:.3}"));
             let share = |key: &str| v[key].as_f64().map_or("-".into(), |x| format!("{:.1} %", 100.0 * x));
             let ratio = |key: &str| match v[key].as_array().map(|a| a.iter().filter_map(Value::as_f64)) {
@@ -161,12 +166,14 @@ pub fn tables(report: &Report) -> String {
                 None => "-".into(),
             };
             lines.push(format!(
-                "| {} | {} | {} | {} | {} | {} | {} | {} | {} |",
+                "| {} | {} | {} | {} | {} | {} | {} | {} | {} | {} | {} |",
                 s.name,
                 metres("pane_mae"),
                 ratio("pane_by_linear"),
+                ratio("pane_by_first"),
                 metres("elsewhere_mae"),
                 ratio("elsewhere_by_linear"),
+                ratio("elsewhere_by_first"),
                 share("sees_the_pane"),
                 share("sees_the_pane_where_measured_through"),
                 share("flagged_of_measured_through"),
