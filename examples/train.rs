@@ -1,15 +1,16 @@
-//! Trains the tiny checkpoint on procedural scenes.
+//! Trains the tiny checkpoint on rendered scenes.
 //!
-//! `cargo run --release --example train -- --out DIR [--steps N] [--from DIR | --resume]`
+//! `cargo run --release --example train -- --out DIR [--steps N] [--mix MIX] [--from DIR [--tune] | --resume]`
 //!
 //! Writes DIR/{config,preprocessor_config,sdim,tokenizer}.json, model.safetensors (what `--model DIR` loads),
 //! train.json and trainer.safetensors (the configuration and the state that `--resume` continues from), curve.csv, and
-//! DIR/best: the checkpoint that did best on held-out scenes so far.
+//! DIR/best: the checkpoint that did best on held-out scenes so far. With `--adapter-of BASE` also DIR/adapter, which is loaded on top of BASE.
 
 use anyhow::Context;
 use clap::parser::ValueSource;
 use clap::{ArgMatches, CommandFactory, FromArgMatches, Parser};
-use sdim::internals::supervise::{LabelSource, StepReport, TrainConfig, Trainer, evaluate};
+use sdim::internals::scenes::furnished::Library;
+use sdim::internals::supervise::{Base, LabelSource, SceneMix, StepReport, TrainConfig, Trainer, evaluate};
 use sdim::settings::Settings;
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -38,9 +39,25 @@ struct Args {
     /// Labels: `dense` ground truth, or `sparse` measurements held back from the prompt.
     #[arg(long, default_value = "dense", value_parser = ["dense", "sparse"])]
     labels: String,
-    /// Start from the weights of this checkpoint instead of random ones.
+    /// Shares of the scenes: procedural, furnished (rooms of the models in --library), streets and glazed (panes of glass, whose depth is the
+    /// answer though a sensor sees through them), NAME=SHARE,...
+    #[arg(long, default_value_t = TrainConfig::default().batch.mix)]
+    mix: SceneMix,
+    /// Folder of furniture, as scripts/furniture.sh made it or packed by the example `furniture`; to be told again with --resume.
+    #[arg(long, value_name = "DIR")]
+    library: Option<PathBuf>,
+    /// Sizes of the frames, pixels, one drawn per step: 256x192,192x144
+    #[arg(long, value_delimiter = ',', value_parser = size, value_name = "WxH")]
+    size: Vec<(usize, usize)>,
+    /// Go on from what is known: a short warm-up, sharp targets, statistics of the fusion block as they are.
+    #[arg(long, requires = "from")]
+    tune: bool,
+    /// Go on from this checkpoint, of any shape, instead of a fresh tiny one.
     #[arg(long, value_name = "DIR", conflicts_with = "resume")]
     from: Option<PathBuf>,
+    /// Also write DIR/adapter: the tensors that differ from those of this checkpoint, the one of --from, in f32.
+    #[arg(long, value_name = "DIR")]
+    adapter_of: Option<PathBuf>,
     /// Continue from DIR/train.json and DIR/trainer.safetensors: the schedule, the batches and the seed are those of the
     /// first run, and need not be given again.
     #[arg(long)]
@@ -58,6 +75,15 @@ struct Args {
 
 fn at_least_one(text: &str) -> Result<usize, String> {
     text.parse().ok().filter(|&n| n > 0).ok_or_else(|| "expected a number of at least 1".to_string())
+}
+
+fn size(text: &str) -> Result<(usize, usize), String> {
+    let sides = text.split_once('x').and_then(|(w, h)| Some((w.parse().ok()?, h.parse().ok()?)));
+    sides.ok_or_else(|| "expected WIDTHxHEIGHT, such as 256x192".to_string())
+}
+
+fn sizes_as_text(sizes: &[(usize, usize)]) -> String {
+    sizes.iter().map(|(w, h)| format!("{w}x{h}")).collect::<Vec<_>>().join(",")
 }
 
 const HEADER: &str = "step,seconds,loss,l1,gradient,rate,sdim_100,linear_100,sdim_500,linear_500";
@@ -98,7 +124,11 @@ fn config(args: &Args) -> TrainConfig {
         "sparse" => LabelSource::Sparse,
         _ => LabelSource::Dense,
     };
-    config
+    config.batch.mix = args.mix;
+    if !args.size.is_empty() {
+        config.batch.sizes.clone_from(&args.size);
+    }
+    if args.tune { config.tuning() } else { config }
 }
 
 /// Refuses a flag that says otherwise than the run that is to be continued.
@@ -112,6 +142,8 @@ fn check_flags(args: &Args, given: &ArgMatches, run: &TrainConfig) -> anyhow::Re
             ("frames", b.frames.to_string()),
             ("questions", b.questions.to_string()),
             ("labels", label_name(b.labels).to_string()),
+            ("mix", b.mix.to_string()),
+            ("size", sizes_as_text(&b.sizes)),
         ]
     };
     for ((flag, said), (_, was)) in values(&config(args)).into_iter().zip(values(run)) {
@@ -179,14 +211,18 @@ fn main() -> anyhow::Result<()> {
         check_flags(&args, &given, &TrainConfig::load(&args.out)?)?;
         Trainer::resume(&args.out)?
     } else {
-        let mut trainer = Trainer::new(config(&args), &Settings::tiny())?;
-        if let Some(dir) = &args.from {
-            trainer.start_from(dir)?;
-        }
+        let trainer = match &args.from {
+            Some(dir) => Trainer::going_on(config(&args), &Base::load(dir)?)?,
+            None => Trainer::new(config(&args), &Settings::tiny())?,
+        };
         // At once, so that nothing of a run that was here before is taken for this one's.
         trainer.save(&args.out)?;
         trainer
     };
+    if let Some(dir) = &args.library {
+        trainer = trainer.with_library(&Library::open(dir)?)?;
+    }
+    let base = args.adapter_of.as_deref().map(Base::load).transpose()?;
     let path = args.out.join("curve.csv");
     let (rows, before) = curve_until(&path, trainer.step())?;
     let mut best = rows.iter().filter_map(|r| score(r)).fold(f32::INFINITY, f32::min);
@@ -214,6 +250,9 @@ fn main() -> anyhow::Result<()> {
         writeln!(curve, "{row}")?;
         eprintln!("{row}");
         if save {
+            if let Some(base) = &base {
+                trainer.adapter(base)?.save(&args.out.join("adapter"))?;
+            }
             // Last: a run that is interrupted before it does these steps again, and writes the same.
             trainer.save(&args.out)?;
         }

@@ -180,6 +180,47 @@ fn train_resumes_and_its_checkpoint_loads() {
 }
 
 #[test]
+fn train_goes_on_from_a_checkpoint_and_says_what_it_changed() {
+    let dir = tempfile::tempdir().unwrap();
+    let model = dir.path().join("model");
+    let tiny = Path::new(env!("CARGO_MANIFEST_DIR")).join("assets/sdim-tiny");
+    let steps =
+        ["--steps", "1", "--frames", "1", "--questions", "8", "--size", "64x48", "--out", text(&model)];
+    let tuned = ["--from", text(&tiny), "--adapter-of", text(&tiny), "--tune", "--mix", "glazed=1"];
+    let out = run("train", &[&steps[..], &tuned[..]].concat());
+    assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
+    let read = |path: &Path| std::fs::read(path).unwrap();
+    let config: Value = serde_json::from_slice(&read(&model.join("train.json"))).unwrap();
+    assert_eq!((config["batch"]["mix"]["glazed"].as_f64(), config["widen"].as_f64()), (Some(1.0), Some(0.0)));
+    assert_eq!(config["batch"]["sizes"], serde_json::json!([[64, 48]]));
+    // All that the checkpoint says of itself stays, its confidence, too.
+    assert_eq!(read(&model.join("sdim.json")), read(&tiny.join("sdim.json")));
+    let adapter = sdim::Adapter::load(&model.join("adapter")).unwrap();
+    assert!(adapter.tensors.len() > 20 && adapter.tensors.contains_key("model.embed_tokens.weight"));
+    let plain = |more: &[&str]| {
+        let out =
+            run("complete", &[&["--plan", "stride:32", "--json", "--out", text(dir.path())], more].concat());
+        assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
+        serde_json::from_slice::<Value>(&out.stdout).unwrap()["mae"].as_f64().unwrap()
+    };
+    let (before, after) = (plain(&[]), plain(&["--adapter", text(&model.join("adapter"))]));
+    assert!(before != after && (after / before - 1.0).abs() < 0.2, "{before} {after}");
+    for bad in [
+        &["--tune"][..],
+        &["--mix", "rooms=1"],
+        &["--mix", "furnished=1"],
+        &["--size", "65x48"],
+        &["--size", "64"],
+        &["--from", "/nowhere"],
+        &["--library", "/nowhere"],
+    ] {
+        let failed = run("train", &[&["--out", text(&dir.path().join("bad")), "--steps", "1"], bad].concat());
+        let said = String::from_utf8_lossy(&failed.stderr).into_owned();
+        assert!(!failed.status.success() && !said.contains("panicked"), "{bad:?}: {said}");
+    }
+}
+
+#[test]
 fn throughput_times_each_stage() {
     for weights in ["f32", "bf16", "int8"] {
         let args = ["--random", "tiny", "--width", "64", "--height", "48", "--queries", "40"];

@@ -11,7 +11,8 @@
 # Settings, by the environment, with what they are without it:
 #   MODELS=small: one or more, trained at the same time from the same records; all ask in the way of the first one
 #   SECONDS_TOTAL=600  SIZE=384x288  PROMPT=512  QUESTIONS=128  VARIANTS=4  SHARD=64  BATCH=64  RATE=1.5e-3  POINTS=40,1500
-#   MIX: procedural=0.5,furnished=0.35,streets=0.15 with furniture in the pack, procedural=0.85,streets=0.15 without
+#   MIX: procedural=0.5,furnished=0.35,streets=0.15 with furniture in the pack, procedural=0.85,streets=0.15 without;
+#       glazed=SHARE adds panes of glass that sensors see through
 #   HELD_MIX: mixes of the held-out sets, spaces between; procedural=1, and furnished=1 with furniture
 #   HELD_FRAMES=128  WAIT_FRAMES=1024  MAX_GB=30  SEED=7  GPUS and THREADS: all; PYTHON=python3; WORK: a temporary folder
 #   RECORDS_ARGS, TRAIN_ARGS, TRAIN_ARGS_MODEL: more arguments for the programs; INIT_MODEL: a checkpoint to start from

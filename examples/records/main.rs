@@ -91,7 +91,8 @@ struct Args {
     /// Share of the frames among whose measurements are bad ones; 0 without it for frames of a data set.
     #[arg(long)]
     errors: Option<f32>,
-    /// Which scenes: shares of procedural, furnished and streets, NAME=SHARE,...; procedural alone without it.
+    /// Which scenes: shares of procedural, furnished, streets and glazed (panes that a sensor sees through), NAME=SHARE,...; procedural alone
+    /// without it.
     #[arg(long)]
     mix: Option<SceneMix>,
     /// Folder of furniture for furnished rooms, as it was installed or packed. Held-out records have models of their own.

@@ -4,7 +4,8 @@
 //! [--height H] [--points P | --rings R | --rig SEED] [--sheet FILE]`
 //!
 //! Recipes: `procedural` (the default), `furnished` (rooms of the models in `--library`, see `scripts/furniture.sh`),
-//! `street-lidar` (streets from a car, to be measured with `--rings`) and `training` (what models are trained on: frames of
+//! `street-lidar` (streets from a car, to be measured with `--rings`), `glazed` (rooms behind panes, of which
+//! a sensor sees next to nothing: what is measured lies behind them mostly; a sheet has the sensor's map as a third picture) and `training` (what models are trained on: frames of
 //! `--mix` with the measurements that are told, bad ones among them). `--rig SEED` is a camera and a sensor of that seed: their colours,
 //! noise and pattern in every frame, the clean depth as ground truth.
 
@@ -17,7 +18,7 @@ use rand_chacha::ChaCha8Rng;
 use sdim::depth::{io, sample_points};
 use sdim::internals::benchmarks::{DepthFile, write_frame};
 use sdim::internals::scenes::furnished::{Library, Split, furnished};
-use sdim::internals::scenes::{RgbdFrame, Rig, SpinningLidar, procedural, street};
+use sdim::internals::scenes::{RgbdFrame, Rig, SpinningLidar, glazed, procedural, street};
 use sdim::internals::supervise::{self, BatchConfig, SceneMix, Scenes, mix, told_and_asked, training_seed};
 use sdim::{DepthScale, SparseDepth};
 use std::path::PathBuf;
@@ -36,7 +37,7 @@ struct Args {
     /// Folder of furniture, as it was installed or packed.
     #[arg(long, required_if_eq("recipe", "furnished"))]
     library: Option<PathBuf>,
-    /// Shares of the scenes of `--recipe training`: procedural, furnished and streets, NAME=SHARE,...
+    /// Shares of the scenes of `--recipe training`: procedural, furnished, streets and glazed, NAME=SHARE,...
     #[arg(long, default_value = "procedural=1")]
     mix: SceneMix,
     /// Which models and rooms.
@@ -70,6 +71,7 @@ enum Recipe {
     Procedural,
     Furnished,
     StreetLidar,
+    Glazed,
     Training,
 }
 
@@ -120,6 +122,7 @@ impl Args {
             Recipe::Training => bail!("--recipe training: made with its measurements"),
             Recipe::Procedural => procedural(seed, self.width, self.height)?,
             Recipe::StreetLidar => street(seed, self.width, self.height)?,
+            Recipe::Glazed => glazed(seed, self.width, self.height)?,
             Recipe::Furnished => {
                 let library = library.context("--recipe furnished: expected --library DIR")?;
                 furnished(library, seed, self.width, self.height)?
@@ -132,9 +135,9 @@ impl Args {
         if let Some(rings) = self.rings {
             let mut rng = ChaCha8Rng::seed_from_u64(seed);
             let lidar = SpinningLidar::rings(rings)?.mounted(&mut rng);
-            return Ok(Some(lidar.scan(&frame.depth, w, h, &frame.intrinsics, &mut rng)?));
+            return Ok(Some(lidar.scan(frame.sensed(), w, h, &frame.intrinsics, &mut rng)?));
         }
-        Ok(self.points.map(|n| sample_points(&frame.depth, w, h, n, seed)).transpose()?)
+        Ok(self.points.map(|n| sample_points(frame.sensed(), w, h, n, seed)).transpose()?)
     }
 }
 
@@ -142,7 +145,14 @@ fn main() -> anyhow::Result<()> {
     let args = Args::parse();
     let scale = DepthScale::millimetres();
     let library = args.library()?;
-    let mut sheet = args.sheet.as_ref().map(|_| sheet::Sheet::new(args.count, args.width, args.height));
+    let mut sheet = args.sheet.as_ref().map(|_| {
+        sheet::Sheet::new(
+            args.count,
+            args.width,
+            args.height,
+            if args.recipe == Recipe::Glazed { 3 } else { 2 },
+        )
+    });
     for seed in args.seed..args.seed + args.count {
         let (frame, measured) = args.made(library.as_ref(), seed)?;
         if let Some(sheet) = &mut sheet {

@@ -7,32 +7,42 @@ use sdim::draw::colour::{depth_range, depth_to_rgb};
 use sdim::internals::scenes::RgbdFrame;
 use std::path::Path;
 
-/// Pairs of a frame and its depth in a row.
-const COLUMNS: u32 = 4;
+/// Pictures in a row, of frames and of their depths.
+const COLUMNS: u32 = 8;
 
 pub struct Sheet {
     image: RgbImage,
     cell: (u32, u32),
+    /// Pictures of a frame, and frames in a row.
+    pictures: u32,
+    across: u32,
     next: u32,
 }
 
 impl Sheet {
-    pub fn new(count: u64, width: usize, height: usize) -> Self {
-        let (cell, rows) = ((2 * width as u32, height as u32), (count as u32).div_ceil(COLUMNS));
-        Self { image: RgbImage::new(COLUMNS * cell.0, rows * cell.1), cell, next: 0 }
+    /// A sheet for so many frames, each with its depth beside it; with `pictures` 3 also with what a sensor sees.
+    pub fn new(count: u64, width: usize, height: usize, pictures: u32) -> Self {
+        let (cell, across) = ((width as u32, height as u32), COLUMNS / pictures);
+        let rows = (count as u32).div_ceil(across);
+        let image = RgbImage::new(across * pictures * cell.0, rows * cell.1);
+        Self { image, cell, pictures, across, next: 0 }
     }
 
     /// Adds a frame; measurements are drawn white on its depth.
     pub fn add(&mut self, frame: &RgbdFrame, measured: Option<&SparseDepth>) -> anyhow::Result<()> {
         let (w, h) = (frame.width(), frame.height());
-        let (near, far) = depth_range(&frame.depth).unwrap_or((0.0, 1.0));
+        let (near, far) = depth_range(frame.sensed()).unwrap_or((0.0, 1.0));
+        let (near, far) = depth_range(&frame.depth).map_or((near, far), |(n, f)| (near.min(n), far.max(f)));
         let mut depth = depth_to_rgb(&frame.depth, w, h, near, far)?;
         for (x, y, _) in measured.into_iter().flat_map(SparseDepth::points) {
             depth.put_pixel(x as u32, y as u32, Rgb([255; 3]));
         }
-        let (x, y) = (self.next % COLUMNS * self.cell.0, self.next / COLUMNS * self.cell.1);
-        imageops::replace(&mut self.image, &frame.rgb, x.into(), y.into());
-        imageops::replace(&mut self.image, &depth, (x + w as u32).into(), y.into());
+        let sensed = depth_to_rgb(frame.sensed(), w, h, near, far)?;
+        let first = self.next % self.across * self.pictures;
+        let y = self.next / self.across * self.cell.1;
+        for (k, picture) in (0..self.pictures).zip([&frame.rgb, &depth, &sensed]) {
+            imageops::replace(&mut self.image, picture, ((first + k) * self.cell.0).into(), y.into());
+        }
         self.next += 1;
         Ok(())
     }

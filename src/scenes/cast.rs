@@ -4,7 +4,7 @@
 
 use super::camera::Camera;
 use super::shapes::{Kind, NEAR, Solid, hit_cuboid, hit_cut, hit_ellipsoid, hit_frustum};
-use super::space::{V3, add, mul, sub, times, to_world};
+use super::space::{V3, add, dot, mul, sub, times, to_local, to_world};
 
 /// Pixels that are skipped together behind nearer solids.
 const RUN: usize = 16;
@@ -28,6 +28,32 @@ struct Reach {
 }
 
 pub(super) fn cast(solids: &[Solid], camera: &Camera, width: usize, height: usize) -> Hits {
+    cast_where(solids, camera, width, height, |_| |_, _, t| t)
+}
+
+/// As [`cast`], of hits with `dot(normal, p) > offset` alone: rays start at a plane. A solid that one starts in is not seen by it.
+pub(super) fn cast_beyond(
+    solids: &[Solid],
+    camera: &Camera,
+    width: usize,
+    height: usize,
+    (normal, offset): (V3, f32),
+) -> Hits {
+    cast_where(solids, camera, width, height, |solid| {
+        // The plane in the solid's unit frame.
+        let (n, c) = (times(to_local(&solid.axes, normal), solid.half), offset - dot(normal, solid.centre));
+        move |o, d, t| if dot(n, o) + t * dot(n, d) > c { t } else { f32::INFINITY }
+    })
+}
+
+/// Casts; `keep` makes of a solid what judges its hits, by the ray's origin and direction in its unit frame and the parameter.
+fn cast_where<K: Fn(V3, V3, f32) -> f32>(
+    solids: &[Solid],
+    camera: &Camera,
+    width: usize,
+    height: usize,
+    keep: impl Fn(&Solid) -> K,
+) -> Hits {
     let mut hits = Hits { depth: vec![f32::INFINITY; width * height], solid: vec![NOTHING; width * height] };
     let mut reaches: Vec<Reach> =
         solids.iter().enumerate().filter_map(|(i, s)| reach(s, i as u32, camera, width, height)).collect();
@@ -35,12 +61,15 @@ pub(super) fn cast(solids: &[Solid], camera: &Camera, width: usize, height: usiz
     reaches.sort_by(|a, b| a.nearest.total_cmp(&b.nearest));
     for r in &reaches {
         let solid = &solids[r.solid as usize];
+        let k = keep(solid);
         match solid.kind {
-            Kind::Cuboid => scan(solid, r, camera, width, &mut hits, hit_cuboid),
-            Kind::Ellipsoid => scan(solid, r, camera, width, &mut hits, hit_ellipsoid),
-            Kind::Frustum { top } => scan(solid, r, camera, width, &mut hits, |o, d| hit_frustum(o, d, top)),
+            Kind::Cuboid => scan(solid, r, camera, width, &mut hits, |o, d| k(o, d, hit_cuboid(o, d))),
+            Kind::Ellipsoid => scan(solid, r, camera, width, &mut hits, |o, d| k(o, d, hit_ellipsoid(o, d))),
+            Kind::Frustum { top } => {
+                scan(solid, r, camera, width, &mut hits, |o, d| k(o, d, hit_frustum(o, d, top)))
+            }
             Kind::Cut { normal, offset } => {
-                scan(solid, r, camera, width, &mut hits, |o, d| hit_cut(o, d, normal, offset))
+                scan(solid, r, camera, width, &mut hits, |o, d| k(o, d, hit_cut(o, d, normal, offset)))
             }
         }
     }

@@ -6,9 +6,11 @@
 mod camera;
 mod cast;
 mod drive;
+mod frame;
 #[cfg(feature = "meshes")]
 pub mod furnished;
 mod furniture;
+mod glazed;
 mod lidar;
 mod light;
 mod objects;
@@ -30,33 +32,12 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::depth::Intrinsics;
 use crate::error::{Error, Result};
+pub use frame::{Glass, RgbdFrame};
+pub use glazed::glazed;
 pub use lidar::SpinningLidar;
 pub use rig::Rig;
 pub use scene::Scene;
 use stage::Stage;
-
-/// An RGB image with the depth of every pixel.
-#[derive(Clone, Debug)]
-pub struct RgbdFrame {
-    /// 8-bit sRGB-like picture.
-    pub rgb: RgbImage,
-    /// Exact Z-depth, metres, row-major, `width * height` values; NaN where nothing returns (sky).
-    pub depth: Vec<f32>,
-    /// The camera.
-    pub intrinsics: Intrinsics,
-}
-
-impl RgbdFrame {
-    /// Columns.
-    pub fn width(&self) -> usize {
-        self.rgb.width() as usize
-    }
-
-    /// Rows.
-    pub fn height(&self) -> usize {
-        self.rgb.height() as usize
-    }
-}
 
 /// Largest side of a rendered frame, pixels.
 const LARGEST_SIDE: usize = 8192;
@@ -70,7 +51,7 @@ pub fn procedural(seed: u64, width: usize, height: usize) -> Result<RgbdFrame> {
     let rgb = picture(&mut stage, &hits, width, height);
     let scale = scale(&mut stage);
     let depth = hits.depth.iter().map(|&t| if t.is_finite() { t * scale } else { f32::NAN }).collect();
-    Ok(RgbdFrame { rgb, depth, intrinsics: stage.camera.k })
+    Ok(RgbdFrame { rgb, depth, intrinsics: stage.camera.k, glass: None })
 }
 
 /// The scene of [`procedural`] before its picture is taken, and what its camera sees.
@@ -113,7 +94,7 @@ pub fn street(seed: u64, width: usize, height: usize) -> Result<RgbdFrame> {
     }
     let rgb = picture(&mut stage, &hits, width, height);
     let depth = hits.depth.iter().map(|&t| if t.is_finite() { t } else { f32::NAN }).collect();
-    Ok(RgbdFrame { rgb, depth, intrinsics: stage.camera.k })
+    Ok(RgbdFrame { rgb, depth, intrinsics: stage.camera.k, glass: None })
 }
 
 fn picture(stage: &mut Stage, hits: &cast::Hits, width: usize, height: usize) -> RgbImage {

@@ -52,7 +52,7 @@ impl Rig {
     pub fn take(&self, frame: &RgbdFrame, seed: u64) -> Result<(RgbImage, SparseDepth)> {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         rng.set_stream(3);
-        let depth = self.sensor.measure(&frame.rgb, &frame.depth, &mut rng)?;
+        let depth = self.sensor.measure(&frame.rgb, frame.sensed(), &mut rng)?;
         let picture = self.camera.photograph(&self.filtered(&frame.rgb), &mut rng)?;
         let (width, height) = (frame.width(), frame.height());
         let sparse = self.pattern.sample(&frame.rgb, &depth, width, height, self.points, &mut rng)?;

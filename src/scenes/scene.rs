@@ -50,7 +50,12 @@ impl Scene {
         let hits = cast::cast(&stage.solids, &stage.camera, width, height);
         let rgb = picture(&mut stage, &hits, width, height);
         let metres = |&t: &f32| if t.is_finite() { t * self.scale } else { f32::NAN };
-        RgbdFrame { rgb, depth: hits.depth.iter().map(metres).collect(), intrinsics: stage.camera.k }
+        RgbdFrame {
+            rgb,
+            depth: hits.depth.iter().map(metres).collect(),
+            intrinsics: stage.camera.k,
+            glass: None,
+        }
     }
 }
 

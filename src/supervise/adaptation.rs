@@ -38,12 +38,10 @@ struct Seen {
 const HELD_BACK: f32 = 0.25;
 
 impl Adaptation {
-    /// What a run of so many steps is made of: small steps from what is known, statistics of the fusion block as they are, targets as
-    /// sharp as at the end of training.
+    /// What a run of so many steps is made of: small steps from what is known ([`TrainConfig::tuning`]).
     pub fn config(steps: usize, seed: u64) -> TrainConfig {
-        let mut config = TrainConfig {
+        TrainConfig {
             steps,
-            warmup: (steps / 10).clamp(1, 20),
             rate: 3e-4,
             seed,
             batch: BatchConfig {
@@ -53,12 +51,9 @@ impl Adaptation {
                 labels: LabelSource::Sparse,
                 ..BatchConfig::default()
             },
-            freeze_norm_at: 0.0,
-            widen: 0.0,
             ..TrainConfig::default()
-        };
-        config.optimiser.average = 0.98;
-        config
+        }
+        .tuning()
     }
 
     /// Starts from a checkpoint. Of the configuration's batch only the number of frames, of questions and of measurements in the

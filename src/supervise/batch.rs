@@ -87,10 +87,14 @@ pub fn held_out_seed(random: u64) -> u64 {
 /// Makes the examples of one step, in parallel; the same seed and step give the same batch.
 ///
 /// # Errors
-/// Errors of the prompt writer; a frame without any return is replaced by the next seed's. [`Error::Argument`] for a mix with
-/// furnished rooms, for which there is no furniture here.
-pub fn make(model: &SdimModel, config: &BatchConfig, seed: u64, step: u64) -> Result<Vec<Example>> {
-    let scenes = Scenes::new(config.mix);
+/// Errors of the prompt writer; a frame without any return is replaced by the next seed's. As [`Scenes::check`].
+pub fn make(
+    model: &SdimModel,
+    config: &BatchConfig,
+    scenes: &Scenes,
+    seed: u64,
+    step: u64,
+) -> Result<Vec<Example>> {
     scenes.check(false)?;
     let size = config.sizes[(mix(seed ^ 0x51CE, step) % config.sizes.len() as u64) as usize];
     (0..config.frames as u64)
@@ -99,7 +103,7 @@ pub fn make(model: &SdimModel, config: &BatchConfig, seed: u64, step: u64) -> Re
             let base = mix(seed, step * config.frames as u64 + i);
             let mut tries = 0;
             loop {
-                match example(model, config, &scenes, mix(base, tries), size) {
+                match example(model, config, scenes, mix(base, tries), size) {
                     Err(_) if tries < 8 => tries += 1,
                     other => return other,
                 }
@@ -284,15 +288,9 @@ pub(super) fn written_on(
 
 /// Mirrors, drops the colour or mixes the channels of a frame.
 fn augment(frame: &mut RgbdFrame, rng: &mut ChaCha8Rng) {
-    let (width, height) = (frame.rgb.width() as usize, frame.rgb.height() as usize);
     if rng.random_bool(0.5) {
-        image::imageops::flip_horizontal_in_place(&mut frame.rgb);
-        for row in frame.depth.chunks_mut(width) {
-            row.reverse();
-        }
-        frame.intrinsics.cx = (width - 1) as f32 - frame.intrinsics.cx;
+        frame.mirror();
     }
-    debug_assert_eq!(frame.depth.len(), width * height);
     let mut order = [0, 1, 2];
     if rng.random_bool(0.3) {
         order.shuffle(rng);
@@ -326,7 +324,7 @@ fn split(measured: &SparseDepth, rng: &mut ChaCha8Rng) -> Result<(SparseDepth, O
 mod tests {
     use super::super::asked::tests::post;
     use super::*;
-    use crate::scenes::procedural;
+    use crate::scenes::{glazed, procedural};
 
     #[test]
     fn labels_stay_clean_whatever_is_told() {
@@ -342,6 +340,27 @@ mod tests {
             let (told, _) = told_and_asked(&mut seen, &clean, None, &mut rng).unwrap();
             assert!(told.points().all(|(_, _, d)| d == 1.0 || d == 3.0));
         }
+    }
+
+    #[test]
+    fn panes_are_measured_through_and_asked_for_themselves() {
+        let (mut through, mut asked_at_panes) = (0, 0);
+        for (seed, sensors) in (0..12).flat_map(|seed| [(seed, 0.0), (seed, 1.0)]) {
+            let frame = glazed(seed, 64, 48).unwrap();
+            let glass = frame.glass.clone().unwrap();
+            let config = BatchConfig { sensors, errors: 0.0, ..Default::default() };
+            let mut rng = ChaCha8Rng::seed_from_u64(seed);
+            let (told, asked) = told_and_asked(&mut frame.clone(), &config, None, &mut rng).unwrap();
+            if sensors == 0.0 {
+                assert!(told.points().all(|(x, y, d)| d == glass.sensed[y * 64 + x]));
+            }
+            let pane = |x: usize, y: usize| glass.pane[y * 64 + x];
+            let beyond = |&(x, y, d): &(usize, usize, f32)| pane(x, y) && d > 1.3 * frame.depth[y * 64 + x];
+            through += told.points().filter(beyond).count();
+            assert!(asked.iter().all(|&(x, y, d)| d == frame.depth[y * 64 + x]));
+            asked_at_panes += asked.iter().filter(|p| pane(p.0, p.1)).count();
+        }
+        assert!(through > 100 && asked_at_panes > 100, "{through} {asked_at_panes}");
     }
 
     #[test]

@@ -57,6 +57,14 @@ impl Default for TrainConfig {
 }
 
 impl TrainConfig {
+    /// The same for a run that goes on from a checkpoint: a short warm-up, statistics of the fusion block as they are, targets as
+    /// sharp as at the end of training, an average over fewer steps.
+    pub fn tuning(mut self) -> Self {
+        self.warmup = (self.steps / 10).clamp(1, 20);
+        (self.freeze_norm_at, self.widen, self.optimiser.average) = (0.0, 0.0, 0.98);
+        self
+    }
+
     /// Reads `train.json` of a run's directory.
     ///
     /// # Errors

@@ -58,7 +58,7 @@ impl KnownFrame {
             SparseDepth::new(width, height, moved)
         });
         let intrinsics = Intrinsics::from_fov(width, height, FIELD_OF_VIEW);
-        let frame = RgbdFrame { rgb: bicubic(rgb, width, height), depth, intrinsics };
+        let frame = RgbdFrame { rgb: bicubic(rgb, width, height), depth, intrinsics, glass: None };
         Ok(Self { name, frame, measured: measured.transpose()? })
     }
 
@@ -68,8 +68,7 @@ impl KnownFrame {
     /// As [`SparseDepth::from_points`].
     pub fn mirrored(mut self) -> Result<Self> {
         let width = self.frame.width();
-        image::imageops::flip_horizontal_in_place(&mut self.frame.rgb);
-        self.frame.depth.chunks_mut(width).for_each(<[f32]>::reverse);
+        self.frame.mirror();
         if let Some(sparse) = &self.measured {
             let points: Vec<_> = sparse.points().map(|(x, y, d)| (width - 1 - x, y, d)).collect();
             self.measured = Some(SparseDepth::from_points(width, sparse.height(), &points)?);
@@ -181,7 +180,7 @@ impl RecordConfig {
             (measured, RecordSet::HeldOut { points, .. }) => {
                 let drawn = || {
                     let (w, h) = (frame.width(), frame.height());
-                    SparsePattern::Uniform.sample(&frame.rgb, &frame.depth, w, h, points, rng)
+                    SparsePattern::Uniform.sample(&frame.rgb, frame.sensed(), w, h, points, rng)
                 };
                 let measured = measured.clone().map_or_else(drawn, Ok)?;
                 (measured, BatchConfig { errors: 0.0, edges: 0.0, ..self.batch.clone() })

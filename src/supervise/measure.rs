@@ -10,8 +10,8 @@ use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
 /// Measurements of a frame: a pattern and a number of points drawn at random. A share of the frames is seen by a random
-/// camera and measured by a random depth sensor; the frame's depth, of which labels are made, stays clean. With a `picture`
-/// that such a camera has taken already, that one is the frame's.
+/// camera and measured by a random depth sensor, which sees through panes; the frame's depth, of which labels are made, stays
+/// clean. With a `picture` that such a camera has taken already, that one is the frame's.
 pub(super) fn measure(
     frame: &mut RgbdFrame,
     config: &BatchConfig,
@@ -23,12 +23,9 @@ pub(super) fn measure(
         if let Some(picture) = picture {
             frame.rgb.clone_from(picture);
         }
-        let depth = std::mem::take(&mut frame.depth);
-        let measured = pattern.sample(frame, &depth, rng);
-        frame.depth = depth;
-        return measured;
+        return pattern.sample(frame, frame.sensed(), rng);
     }
-    let measured = DepthSensor::draw(rng).measure(&frame.rgb, &frame.depth, rng)?;
+    let measured = DepthSensor::draw(rng).measure(&frame.rgb, frame.sensed(), rng)?;
     frame.rgb = match picture {
         Some(picture) => picture.clone(),
         None => CameraModel::draw(rng).photograph(&frame.rgb, rng)?,
@@ -265,6 +262,7 @@ mod tests {
             rgb: RgbImage::new(96, 64),
             depth: vec![f32::NAN; 96 * 64],
             intrinsics: Intrinsics::from_fov(96, 64, 1.0),
+            glass: None,
         };
         assert!(measure(&mut nothing.clone(), &config, None, &mut rng).is_err());
     }

@@ -3,7 +3,7 @@
 use crate::error::{Error, Result};
 #[cfg(feature = "meshes")]
 use crate::scenes::furnished::{Library, Split, furnished};
-use crate::scenes::{RgbdFrame, procedural, street};
+use crate::scenes::{RgbdFrame, glazed, procedural, street};
 use std::str::FromStr;
 
 /// Shares of the recipes of scenes; only their ratios count.
@@ -19,12 +19,20 @@ pub struct SceneMix {
     /// Streets from a car ([`street`]).
     #[serde(default)]
     pub streets: f32,
+    /// Rooms, halls and yards behind panes that a sensor sees through ([`glazed`]).
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub glazed: f32,
+}
+
+/// Of a share: files of mixes without it stay as they were.
+fn is_zero(share: &f32) -> bool {
+    *share == 0.0
 }
 
 impl Default for SceneMix {
     /// Procedural scenes alone.
     fn default() -> Self {
-        Self { procedural: 1.0, furnished: 0.0, streets: 0.0 }
+        Self { procedural: 1.0, furnished: 0.0, streets: 0.0, glazed: 0.0 }
     }
 }
 
@@ -34,15 +42,17 @@ impl FromStr for SceneMix {
     /// `NAME=SHARE` with commas between: `procedural=0.5,furnished=0.35,streets=0.15`. What is not named has no share.
     fn from_str(text: &str) -> Result<Self> {
         let wrong = || {
-            Error::argument("mix", text, "NAME=SHARE,...; names: procedural, furnished, streets, each once")
+            let expected = "NAME=SHARE,...; names: procedural, furnished, streets, glazed, each once";
+            Error::argument("mix", text, expected)
         };
-        let mut shares: [Option<f32>; 3] = [None; 3];
+        let mut shares: [Option<f32>; 4] = [None; 4];
         for part in text.split(',') {
             let (name, share) = part.split_once('=').ok_or_else(wrong)?;
             let at = match name.trim() {
                 "procedural" => 0,
                 "furnished" => 1,
                 "streets" => 2,
+                "glazed" => 3,
                 _ => return Err(wrong()),
             };
             let share = share.trim().parse().map_err(|_| wrong())?;
@@ -50,10 +60,19 @@ impl FromStr for SceneMix {
                 return Err(wrong());
             }
         }
-        let [procedural, furnished, streets] = shares.map(|s| s.unwrap_or(0.0));
-        let mix = Self { procedural, furnished, streets };
+        let [procedural, furnished, streets, glazed] = shares.map(|s| s.unwrap_or(0.0));
+        let mix = Self { procedural, furnished, streets, glazed };
         mix.check()?;
         Ok(mix)
+    }
+}
+
+impl std::fmt::Display for SceneMix {
+    /// As it is read, without those that have no share.
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let some = self.shares().into_iter().filter(|(share, _)| *share > 0.0);
+        let text: Vec<String> = some.map(|(share, recipe)| format!("{}={share}", recipe.name())).collect();
+        f.write_str(&text.join(","))
     }
 }
 
@@ -63,6 +82,18 @@ enum Recipe {
     Procedural,
     Furnished,
     Streets,
+    Glazed,
+}
+
+impl Recipe {
+    fn name(self) -> &'static str {
+        match self {
+            Self::Procedural => "procedural",
+            Self::Furnished => "furnished",
+            Self::Streets => "streets",
+            Self::Glazed => "glazed",
+        }
+    }
 }
 
 impl SceneMix {
@@ -71,7 +102,7 @@ impl SceneMix {
     /// # Errors
     /// [`Error::Argument`] for a share below 0 or not finite, and when all are 0.
     pub fn check(&self) -> Result<()> {
-        let shares = [self.procedural, self.furnished, self.streets];
+        let shares = self.shares().map(|(share, _)| share);
         let sum: f32 = shares.iter().sum();
         if shares.iter().all(|s| *s >= 0.0) && sum > 0.0 && sum.is_finite() {
             return Ok(());
@@ -79,20 +110,29 @@ impl SceneMix {
         Err(Error::argument("mix", format!("{self:?}"), "shares of at least 0, one of them above it"))
     }
 
+    /// Each recipe with its share.
+    fn shares(&self) -> [(f32, Recipe); 4] {
+        [
+            (self.procedural, Recipe::Procedural),
+            (self.furnished, Recipe::Furnished),
+            (self.streets, Recipe::Streets),
+            (self.glazed, Recipe::Glazed),
+        ]
+    }
+
     /// The recipe at a place between 0 and 1.
     fn pick(&self, at: f32) -> Recipe {
-        let left = at * (self.procedural + self.furnished + self.streets);
-        if left < self.procedural {
-            Recipe::Procedural
-        } else if left < self.procedural + self.furnished {
-            Recipe::Furnished
-        } else if self.streets > 0.0 {
-            Recipe::Streets
-        } else if self.furnished > 0.0 {
-            Recipe::Furnished
-        } else {
-            Recipe::Procedural
+        let shares = self.shares();
+        let left = at * shares.iter().map(|(share, _)| share).sum::<f32>();
+        let (mut below, mut last) = (0.0, Recipe::Procedural);
+        for (share, recipe) in shares.into_iter().filter(|(share, _)| *share > 0.0) {
+            below += share;
+            last = recipe;
+            if left < below {
+                break;
+            }
         }
+        last
     }
 }
 
@@ -160,6 +200,7 @@ impl Scenes {
         match self.mix.pick(place) {
             Recipe::Procedural => procedural(seed, width, height),
             Recipe::Streets => street(seed, width, height),
+            Recipe::Glazed => glazed(seed, width, height),
             #[cfg(feature = "meshes")]
             Recipe::Furnished => {
                 furnished(self.library.as_ref().ok_or_else(no_library)?, seed, width, height)
@@ -183,11 +224,17 @@ mod tests {
     #[test]
     fn names_and_shares_are_read() {
         let mix: SceneMix = "procedural=0.5,furnished=0.35,streets=0.15".parse().unwrap();
-        assert_eq!(mix, SceneMix { procedural: 0.5, furnished: 0.35, streets: 0.15 });
+        assert_eq!(mix, SceneMix { procedural: 0.5, furnished: 0.35, streets: 0.15, glazed: 0.0 });
         let counted = |recipe| (0..1000).filter(|&i| mix.pick(i as f32 / 1000.0) == recipe).count();
         assert!((498..=502).contains(&counted(Recipe::Procedural)));
         assert!((348..=352).contains(&counted(Recipe::Furnished)));
+        assert_eq!(mix.to_string(), "procedural=0.5,furnished=0.35,streets=0.15");
         assert_eq!("procedural=2".parse::<SceneMix>().unwrap().pick(1.0), Recipe::Procedural);
+        let mix: SceneMix = "glazed=0.3,procedural=0.7".parse().unwrap();
+        assert_eq!(mix.to_string(), "procedural=0.7,glazed=0.3");
+        assert_eq!((mix.pick(0.69), mix.pick(0.71)), (Recipe::Procedural, Recipe::Glazed));
+        let frame = Scenes::new(mix).render(1, 0.9, (64, 48)).unwrap();
+        assert!(frame.glass.is_some() && Scenes::new(mix).render(1, 0.1, (64, 48)).unwrap().glass.is_none());
         for wrong in [
             "",
             "rooms=1",
@@ -197,9 +244,20 @@ mod tests {
             "procedural=0",
             "streets=-1",
             "streets=NaN",
+            "glazed=-1",
+            "glazed=1,glazed=1",
         ] {
             let found = wrong.parse::<SceneMix>();
             assert!(matches!(found, Err(Error::Argument { name: "mix", .. })), "{wrong}: {found:?}");
+        }
+    }
+
+    #[test]
+    fn files_of_mixes_without_glass_are_as_they_were() {
+        let text = |mix: SceneMix| serde_json::to_string(&mix).unwrap();
+        assert_eq!(text(SceneMix::default()), r#"{"procedural":1.0,"furnished":0.0,"streets":0.0}"#);
+        for mix in [SceneMix::default(), SceneMix { glazed: 0.25, ..SceneMix::default() }] {
+            assert_eq!(serde_json::from_str::<SceneMix>(&text(mix)).unwrap(), mix);
         }
     }
 

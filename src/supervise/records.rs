@@ -204,7 +204,7 @@ impl RecordConfig {
             return example_again(asking, &self.batch, frame, picture, rng);
         };
         let (width, height) = (frame.width(), frame.height());
-        let sparse = SparsePattern::Uniform.sample(&frame.rgb, &frame.depth, width, height, points, rng)?;
+        let sparse = SparsePattern::Uniform.sample(&frame.rgb, frame.sensed(), width, height, points, rng)?;
         let asked = match grid {
             None => questions(frame, None, (self.batch.questions, 0.0), None, rng),
             Some(step) => (step / 2..height)

@@ -5,6 +5,7 @@ use super::batch::{self, Example};
 use super::config::{CONFIG, TrainConfig};
 use super::init::FreshFiles;
 use super::loss::{self, BinLoss, LossParts, Target};
+use super::mix::Scenes;
 use super::optimiser::{Gradients, Parameters};
 use super::pass;
 use super::store::{self, Progress};
@@ -43,6 +44,8 @@ pub struct Trainer {
     files: FreshFiles,
     parameters: Parameters,
     model: SdimModel,
+    /// Where its frames come from.
+    scenes: Scenes,
     progress: Progress,
     /// The batch of a coming step.
     prefetched: Option<(u64, Vec<Example>)>,
@@ -121,11 +124,22 @@ impl Trainer {
         Ok(trainer)
     }
 
+    /// Goes on from a checkpoint of any shape, with its files, from its weights and with fresh moments at step 0.
+    ///
+    /// # Errors
+    /// As [`Trainer::new`]; [`Error::Tensor`] or [`Error::TensorSet`] if weights and files do not belong together.
+    pub fn going_on(config: TrainConfig, base: &Base) -> Result<Self> {
+        let settings = base.files.parse_of(&base.dir)?.settings;
+        check_shared(&settings, &base.dir.join(SETTINGS).display().to_string())?;
+        check_sizes(&config, &base.files, &base.dir)?;
+        Self::of(config, base, |_| true)
+    }
+
     /// Goes on from a checkpoint of any shape, with its files, and trains the tensors of these names alone, on batches of the caller's
     /// ([`Trainer::step_on`]).
     ///
     /// # Errors
-    /// As [`Trainer::new`] and [`Trainer::start_from`].
+    /// As [`Trainer::going_on`], sizes aside.
     pub fn of(config: TrainConfig, base: &Base, trained: impl Fn(&str) -> bool) -> Result<Self> {
         let mut parameters = Parameters::new(base.files.initial(config.seed)?)?;
         base.fill(&mut parameters)?;
@@ -140,18 +154,18 @@ impl Trainer {
         check_settings(&files.parse_of(dir)?.settings, &place(SETTINGS))?;
         let weights = Weights::from_tensors("training", parameters.tensors());
         let model = SdimModel::new(files.parse()?, &weights, &Device::Cpu)?;
-        Ok(Self { config, files, parameters, model, progress: Progress::default(), prefetched: None })
+        let (scenes, progress) = (Scenes::new(config.batch.mix), Progress::default());
+        Ok(Self { config, files, parameters, model, scenes, progress, prefetched: None })
     }
 
-    /// Starts from the weights of a checkpoint of the same shape, with fresh moments at step 0, as after [`Trainer::new`].
+    /// Furnishes the rooms of the mix with models of a library.
     ///
     /// # Errors
-    /// [`Error::Io`], [`Error::Format`] on a damaged file; [`Error::Tensor`] or [`Error::TensorSet`] if it belongs to another
-    /// model.
-    pub fn start_from(&mut self, dir: &Path) -> Result<()> {
-        store::take_weights(&Weights::from_dir(dir, &Device::Cpu)?, &mut self.parameters)?;
-        (self.progress, self.prefetched) = (Progress::default(), None);
-        Ok(())
+    /// As [`Scenes::with_library`].
+    #[cfg(feature = "meshes")]
+    pub fn with_library(mut self, library: &crate::scenes::furnished::Library) -> Result<Self> {
+        self.scenes = self.scenes.with_library(library, false)?;
+        Ok(self)
     }
 
     /// The run's configuration.
@@ -250,8 +264,8 @@ impl Trainer {
             Some((for_step, examples)) if for_step == step => examples,
             _ => self.make_batch(step)?,
         };
-        let (config, seed) = (self.config.batch.clone(), self.config.seed);
-        let next = |model: &SdimModel| batch::make(model, &config, seed, step + 1);
+        let (config, scenes, seed) = (self.config.batch.clone(), self.scenes.clone(), self.config.seed);
+        let next = |model: &SdimModel| batch::make(model, &config, &scenes, seed, step + 1);
         let (report, next) = self.step_on(&examples, next)?;
         self.prefetched = Some((step + 1, next));
         Ok(report)
@@ -317,7 +331,7 @@ impl Trainer {
     }
 
     fn make_batch(&self, step: u64) -> Result<Vec<Example>> {
-        batch::make(&self.model, &self.config.batch, self.config.seed, step)
+        batch::make(&self.model, &self.config.batch, &self.scenes, self.config.seed, step)
     }
 
     fn update_statistics(&mut self, stats: &[BatchStats]) -> Result<()> {

@@ -216,7 +216,7 @@ fn photograph(
     let colour = expose(&mut room.dice, rendered.colour);
     let finish = finish(&mut room.dice);
     let rgb = super::light::finish(colour, width, height, &finish);
-    RgbdFrame { rgb, depth: rendered.depth, intrinsics: camera.k }
+    RgbdFrame { rgb, depth: rendered.depth, intrinsics: camera.k, glass: None }
 }
 
 /// Automatic exposure: the picture's middle becomes a middle grey unless its bright half would be lost, and what is still too
