@@ -184,10 +184,9 @@ fn train_goes_on_from_a_checkpoint_and_says_what_it_changed() {
     let dir = tempfile::tempdir().unwrap();
     let model = dir.path().join("model");
     let tiny = Path::new(env!("CARGO_MANIFEST_DIR")).join("assets/sdim-tiny");
-    let steps =
-        ["--steps", "1", "--frames", "1", "--questions", "8", "--size", "64x48", "--out", text(&model)];
+    let steps = ["--steps", "1", "--frames", "1", "--questions", "8", "--size", "64x48", "--rate", "2e-5"];
     let tuned = ["--from", text(&tiny), "--adapter-of", text(&tiny), "--tune", "--mix", "glazed=1"];
-    let out = run("train", &[&steps[..], &tuned[..]].concat());
+    let out = run("train", &[&steps[..], &tuned[..], &["--out", text(&model)]].concat());
     assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
     let read = |path: &Path| std::fs::read(path).unwrap();
     let config: Value = serde_json::from_slice(&read(&model.join("train.json"))).unwrap();
