@@ -4,7 +4,8 @@
 //!
 //! Writes DIR/{config,preprocessor_config,sdim,tokenizer}.json, model.safetensors (what `--model DIR` loads),
 //! train.json and trainer.safetensors (the configuration and the state that `--resume` continues from), curve.csv, and
-//! DIR/best: the checkpoint that did best on held-out scenes so far. With `--adapter-of BASE` also DIR/adapter, which is loaded on top of BASE.
+//! DIR/best: the checkpoint that did best on held-out scenes so far. With `--adapter-of BASE` also DIR/adapter, which is loaded on
+//! top of BASE.
 
 use anyhow::Context;
 use clap::parser::ValueSource;
@@ -39,8 +40,8 @@ struct Args {
     /// Labels: `dense` ground truth, or `sparse` measurements held back from the prompt.
     #[arg(long, default_value = "dense", value_parser = ["dense", "sparse"])]
     labels: String,
-    /// Shares of the scenes: procedural, furnished (rooms of the models in --library), streets and glazed (panes of glass, whose depth is the
-    /// answer though a sensor sees through them), NAME=SHARE,...
+    /// Shares of the scenes: procedural, furnished (rooms of the models in --library), streets and glazed (panes of glass, whose
+    /// depth is the answer though a sensor sees through them), NAME=SHARE,...
     #[arg(long, default_value_t = TrainConfig::default().batch.mix)]
     mix: SceneMix,
     /// Folder of furniture, as scripts/furniture.sh made it or packed by the example `furniture`; to be told again with --resume.
@@ -203,26 +204,41 @@ impl Since {
     }
 }
 
+/// The run that is asked for, and the checkpoint that its adapter is for. All that can be wrong is found before anything is written.
+fn begun(args: &Args, given: &ArgMatches) -> anyhow::Result<(Trainer, Option<Base>)> {
+    let library = args.library.as_deref().map(Library::open).transpose()?;
+    let base = args.adapter_of.as_deref().map(Base::load).transpose()?;
+    let mut trainer = match &args.from {
+        _ if args.resume => {
+            check_flags(args, given, &TrainConfig::load(&args.out)?)?;
+            Trainer::resume(&args.out)?
+        }
+        Some(dir) => Trainer::going_on(config(args), &Base::load(dir)?)?,
+        None => Trainer::new(config(args), &Settings::tiny())?,
+    };
+    if let Some(library) = &library {
+        trainer = trainer.with_library(library)?;
+    }
+    trainer.check_scenes()?;
+    if let Some(base) = &base {
+        // Refuses another checkpoint than the one that this run went on from.
+        trainer.adapter(base)?;
+    }
+    if !args.resume {
+        // At once, so that nothing of a run that was here before is taken for this one's.
+        for old in ["best", "adapter"].map(|part| args.out.join(part)).iter().filter(|dir| dir.exists()) {
+            std::fs::remove_dir_all(old).with_context(|| old.display().to_string())?;
+        }
+        trainer.save(&args.out)?;
+    }
+    Ok((trainer, base))
+}
+
 fn main() -> anyhow::Result<()> {
     let given = Args::command().get_matches();
     let args = Args::from_arg_matches(&given).unwrap_or_else(|e| e.exit());
     sdim::internals::kernels::keep_freed_memory();
-    let mut trainer = if args.resume {
-        check_flags(&args, &given, &TrainConfig::load(&args.out)?)?;
-        Trainer::resume(&args.out)?
-    } else {
-        let trainer = match &args.from {
-            Some(dir) => Trainer::going_on(config(&args), &Base::load(dir)?)?,
-            None => Trainer::new(config(&args), &Settings::tiny())?,
-        };
-        // At once, so that nothing of a run that was here before is taken for this one's.
-        trainer.save(&args.out)?;
-        trainer
-    };
-    if let Some(dir) = &args.library {
-        trainer = trainer.with_library(&Library::open(dir)?)?;
-    }
-    let base = args.adapter_of.as_deref().map(Base::load).transpose()?;
+    let (mut trainer, base) = begun(&args, &given)?;
     let path = args.out.join("curve.csv");
     let (rows, before) = curve_until(&path, trainer.step())?;
     let mut best = rows.iter().filter_map(|r| score(r)).fold(f32::INFINITY, f32::min);

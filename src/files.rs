@@ -58,7 +58,7 @@ pub(crate) fn write_tensors<'a>(
     write_whole(path, &bytes)
 }
 
-/// Where the bytes of a file stand until they are whole: a name that no other process and no other thread writes to.
+/// Where the bytes of a file stand until they are whole: a name that no other process of this machine and no other thread writes to.
 pub(crate) fn part_path(path: &Path) -> Result<PathBuf> {
     static WRITTEN: AtomicU64 = AtomicU64::new(0);
     let Some(name) = path.file_name() else {

@@ -100,8 +100,8 @@ fn text(path: &Path) -> &str {
     path.to_str().unwrap()
 }
 
-/// A model that has learnt nothing soon knows what a camera sees that always sees the same: what the program writes then is better at
-/// what was held back, and loads.
+/// An untrained model soon learns a camera that always sees the same scene: the adapter that is written then is better at what was
+/// held back, and loads.
 #[test]
 fn what_is_better_is_written_and_loads() {
     let dir = tempfile::tempdir().unwrap();

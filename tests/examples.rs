@@ -204,8 +204,17 @@ fn train_goes_on_from_a_checkpoint_and_says_what_it_changed() {
     };
     let (before, after) = (plain(&[]), plain(&["--adapter", text(&model.join("adapter"))]));
     assert!(before != after && (after / before - 1.0).abs() < 0.2, "{before} {after}");
+    // What is wrong is found before anything is written: a run that was there stays.
+    let small = common::tiny::small_files(&sdim::settings::Settings::tiny());
+    let other = dir.path().join("other");
+    std::fs::create_dir(&other).unwrap();
+    common::tiny::write(&other, &small, &common::tiny::tensors(&small, 3));
+    let state = read(&model.join("trainer.safetensors"));
     for bad in [
         &["--tune"][..],
+        &["--adapter-of", "/nowhere"],
+        &["--from", text(&tiny), "--adapter-of", text(&other)],
+        &["--mix", "glazed=1", "--labels", "sparse"],
         &["--mix", "rooms=1"],
         &["--mix", "furnished=1"],
         &["--size", "65x48"],
@@ -213,10 +222,11 @@ fn train_goes_on_from_a_checkpoint_and_says_what_it_changed() {
         &["--from", "/nowhere"],
         &["--library", "/nowhere"],
     ] {
-        let failed = run("train", &[&["--out", text(&dir.path().join("bad")), "--steps", "1"], bad].concat());
+        let failed = run("train", &[&["--out", text(&model), "--steps", "1"], bad].concat());
         let said = String::from_utf8_lossy(&failed.stderr).into_owned();
         assert!(!failed.status.success() && !said.contains("panicked"), "{bad:?}: {said}");
     }
+    assert!(state == read(&model.join("trainer.safetensors")));
 }
 
 #[test]

@@ -42,7 +42,7 @@ fn panes_scores_interpolation_and_checkpoints() {
         let pixels: Vec<usize> = (0..map.len()).filter(open).collect();
         let sum: f64 = pixels.iter().map(|&i| f64::from((map[i] - frame.depth[i]).abs())).sum();
         own += sum / pixels.len() as f64 / 3.0;
-        // Nothing behind the panes is in what is told to be at them.
+        // Pixels of panes where interpolation says what is behind.
         off += pixels.iter().filter(|&&i| map[i] > 1.1 * frame.depth[i]).count() as f64;
     }
     assert!((methods[0]["pane_mae"].as_f64().unwrap() / own - 1.0).abs() < 1e-6, "{own} m");

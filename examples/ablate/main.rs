@@ -86,6 +86,9 @@ fn claim(out: &Path, plan: &Plan, library: Option<&Path>) -> anyhow::Result<()> 
     let path = out.join("plan.json");
     let said =
         serde_json::json!({"plan": plan, "library": library.is_some(), "sdim": env!("CARGO_PKG_VERSION")});
+    let text = serde_json::to_string_pretty(&said)?;
+    // As it will be read back: not each number is what it was, once it has been text.
+    let said: serde_json::Value = serde_json::from_str(&text)?;
     std::fs::create_dir_all(out).with_context(|| out.display().to_string())?;
     if path.exists() {
         let text = std::fs::read_to_string(&path).with_context(|| path.display().to_string())?;
@@ -98,12 +101,17 @@ fn claim(out: &Path, plan: &Plan, library: Option<&Path>) -> anyhow::Result<()> 
         );
         return Ok(());
     }
-    std::fs::write(&path, serde_json::to_string_pretty(&said)?).with_context(|| path.display().to_string())
+    std::fs::write(&path, text).with_context(|| path.display().to_string())
 }
 
 fn main() -> anyhow::Result<()> {
     let args = Args::parse();
     ensure!(args.seeds > 0, "--seeds 0: expected at least 1");
+    let counts = [("steps", args.steps), ("first-steps", args.first_steps), ("batch", args.batch)];
+    if let Some((flag, _)) = counts.iter().find(|(_, count)| *count == 0) {
+        anyhow::bail!("--{flag} 0: expected at least 1");
+    }
+    ensure!(args.rate.is_finite() && args.rate > 0.0, "--rate {}: expected a positive number", args.rate);
     rayon::ThreadPoolBuilder::new().num_threads(args.threads).build_global()?;
     sdim::internals::kernels::keep_freed_memory();
     let (plan, cells) = (args.plan(), args.cells()?);

@@ -2,10 +2,11 @@
 //!
 //! `cargo run --release --example panes -- --checkpoint tiny --checkpoint DIR [--scenes 60] [--points 100,500]`
 //!
-//! Completes scenes behind glass that training never saw, from measurements that are made through the panes, and scores the maps at pixels of
-//! panes and elsewhere. Errors are over pixels that were not measured. Of two frames one may be a hundred times as deep as the other, so beside metres
-//! stand geometric means over frames of each error by that of `linear`, and of the first checkpoint, on the same frame. `sees the pane` is the share of pane pixels whose answer
-//! is nearer to the pane than to what is behind it, by their ratio, where the two lie a tenth or more apart; mean over frames.
+//! Completes scenes behind glass that training never saw, from measurements that are made through the panes, and scores the maps at
+//! pixels of panes and elsewhere. Errors are over pixels that were not measured. Of two frames one may be a hundred times as deep as
+//! the other, so beside metres stand geometric means over frames of each error by that of `linear`, and of the first checkpoint, on
+//! the same frame. `sees the pane` is the share of pane pixels whose answer is nearer to the pane than to what is behind it, by
+//! their ratio, where the two lie a tenth or more apart; mean over frames.
 
 #[path = "../common/mod.rs"]
 mod common;

@@ -4,10 +4,10 @@
 //! [--height H] [--points P | --rings R | --rig SEED] [--sheet FILE]`
 //!
 //! Recipes: `procedural` (the default), `furnished` (rooms of the models in `--library`, see `scripts/furniture.sh`),
-//! `street-lidar` (streets from a car, to be measured with `--rings`), `glazed` (rooms behind panes, of which
-//! a sensor sees next to nothing: what is measured lies behind them mostly; a sheet has the sensor's map as a third picture) and `training` (what models are trained on: frames of
-//! `--mix` with the measurements that are told, bad ones among them). `--rig SEED` is a camera and a sensor of that seed: their colours,
-//! noise and pattern in every frame, the clean depth as ground truth.
+//! `street-lidar` (streets from a car, to be measured with `--rings`), `glazed` (rooms behind panes, which a sensor mostly sees
+//! through; a sheet has the sensor's map as a third picture) and `training` (what models are trained on: frames of `--mix` with
+//! the measurements that are told, bad ones among them). `--rig SEED` is a camera and a sensor of that seed: their colours, noise
+//! and pattern in every frame, the clean depth as ground truth.
 
 mod sheet;
 

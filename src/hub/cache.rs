@@ -120,7 +120,7 @@ impl Repository {
         make_parent(&link)?;
         let part = part_path(&link)?;
         let place = |part: &Path| {
-            // One that a process of the same number left there would be written through, into the content itself.
+            // A link that a crashed process with this id left here goes first: a copy would be written through it into the content.
             let _ = fs::remove_file(part);
             if symlink(&Path::new("../../blobs").join(etag), part).is_err() {
                 // Where links are not to be had, the content stands in both places.
@@ -128,7 +128,11 @@ impl Repository {
             }
             fs::rename(part, &link)
         };
-        place(&part).map_err(Error::io(&link))
+        place(&part).map_err(|e| {
+            // Its name is used once, so that no later call would take it up.
+            let _ = fs::remove_file(&part);
+            Error::io(&link)(e)
+        })
     }
 }
 

@@ -12,6 +12,7 @@ const RUN: usize = 16;
 /// No solid was hit.
 pub(super) const NOTHING: u32 = u32::MAX;
 
+#[derive(Clone)]
 pub(super) struct Hits {
     /// Z-depth, metres; infinity where nothing was hit.
     pub depth: Vec<f32>,
@@ -31,7 +32,8 @@ pub(super) fn cast(solids: &[Solid], camera: &Camera, width: usize, height: usiz
     cast_where(solids, camera, width, height, |_| |_, _, t| t)
 }
 
-/// As [`cast`], of hits with `dot(normal, p) > offset` alone: rays start at a plane. A solid that one starts in is not seen by it.
+/// As [`cast`], but only hits with `dot(normal, p) > offset` count, as if each ray started at that plane. A solid that the plane cuts is
+/// not seen by rays that would start inside it.
 pub(super) fn cast_beyond(
     solids: &[Solid],
     camera: &Camera,

@@ -8,8 +8,8 @@ use image::RgbImage;
 pub struct RgbdFrame {
     /// 8-bit sRGB-like picture.
     pub rgb: RgbImage,
-    /// Exact Z-depth, metres, row-major, `width * height` values; NaN where nothing returns (sky). Of a pane of glass it is the
-    /// pane's, whatever is seen through it.
+    /// Exact Z-depth, metres, row-major, `width * height` values; NaN where nothing returns (sky). Where [`RgbdFrame::glass`] is
+    /// set, a pane's is its own, whatever is seen through it; the glass of furnished rooms has none, what is behind it has.
     pub depth: Vec<f32>,
     /// The camera.
     pub intrinsics: Intrinsics,

@@ -1,7 +1,7 @@
 //! The configuration of a training run.
 
 use super::optimiser::AdamW;
-use super::recipe::BatchConfig;
+use super::recipe::{BatchConfig, LabelSource};
 use crate::error::{Error, Result};
 use crate::files::{read_text, write_whole};
 use std::path::Path;
@@ -100,7 +100,13 @@ impl TrainConfig {
         if let Some((name, share)) = b.wrong_share() {
             return Err(Error::config(file, &format!("batch.{name}"), share.to_string(), "0 to 1"));
         }
-        let checks: [(&str, bool, String, &str); 16] = [
+        let checks: [(&str, bool, String, &str); 17] = [
+            (
+                "batch.labels",
+                b.labels == LabelSource::Dense || b.mix.glazed <= 0.0,
+                "sparse, with glazed scenes in the mix".into(),
+                "dense: what is measured there lies behind panes",
+            ),
             (
                 "batch.mix",
                 b.mix.check().is_ok(),
@@ -167,7 +173,7 @@ mod tests {
     fn what_is_written_is_read_back() {
         let dir = tempfile::tempdir().unwrap();
         let mut config = TrainConfig { rate: 1.0 / 3.0, seed: u64::MAX, ..Default::default() };
-        config.batch.labels = crate::supervise::recipe::LabelSource::Sparse;
+        config.batch.labels = LabelSource::Sparse;
         config.optimiser.eps = f32::MIN_POSITIVE;
         config.save(dir.path()).unwrap();
         assert_eq!(TrainConfig::load(dir.path()).unwrap(), config);

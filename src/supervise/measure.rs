@@ -18,7 +18,7 @@ pub(super) fn measure(
     picture: Option<&RgbImage>,
     rng: &mut ChaCha8Rng,
 ) -> Result<SparseDepth> {
-    let pattern = Pattern::draw(Reach::of(&frame.depth), config.points, rng);
+    let pattern = Pattern::draw(Reach::of(frame.sensed()), config.points, rng);
     if rng.random::<f32>() >= config.sensors {
         if let Some(picture) = picture {
             frame.rgb.clone_from(picture);

@@ -139,7 +139,7 @@ impl Trainer {
     /// ([`Trainer::step_on`]).
     ///
     /// # Errors
-    /// As [`Trainer::going_on`], sizes aside.
+    /// As [`Trainer::going_on`], sizes and markers aside.
     pub fn of(config: TrainConfig, base: &Base, trained: impl Fn(&str) -> bool) -> Result<Self> {
         let mut parameters = Parameters::new(base.files.initial(config.seed)?)?;
         base.fill(&mut parameters)?;
@@ -166,6 +166,14 @@ impl Trainer {
     pub fn with_library(mut self, library: &crate::scenes::furnished::Library) -> Result<Self> {
         self.scenes = self.scenes.with_library(library, false)?;
         Ok(self)
+    }
+
+    /// Checks that there are models for all scenes of the mix.
+    ///
+    /// # Errors
+    /// As [`Scenes::check`].
+    pub fn check_scenes(&self) -> Result<()> {
+        self.scenes.check(false)
     }
 
     /// The run's configuration.
@@ -213,8 +221,11 @@ impl Trainer {
     /// What became of a checkpoint: an adapter that holds, in f32, the averages that differ from its weights.
     ///
     /// # Errors
-    /// [`Error::Tensors`] if a tensor cannot be copied; as [`Trainer::of`] if this run is not of that checkpoint.
+    /// [`Error::Argument`] for a checkpoint with other files than this run's; [`Error::Tensors`] if a tensor cannot be copied.
     pub fn adapter(&self, base: &Base) -> Result<Adapter> {
+        if self.files != base.files {
+            return Err(Error::argument("base", base.dir.display(), "what this run went on from"));
+        }
         let mut before = Parameters::new(base.files.initial(self.config.seed)?)?;
         base.fill(&mut before)?;
         let mut tensors = self.parameters.averages()?;

@@ -147,6 +147,7 @@ fn what_another_put_in_place_is_left_alone() {
         // It asks for the content's name, and then for the lock.
         let asked = |seen: &server::Seen| seen.method == "HEAD" && seen.path.ends_with("model.safetensors");
         while !server.state.seen.lock().unwrap().iter().any(asked) {
+            assert!(!waiting.is_finished(), "it ended without asking");
             std::thread::sleep(std::time::Duration::from_millis(5));
         }
         let weights = whole.iter().filter(|(name, _)| *name == "model.safetensors");

@@ -30,7 +30,9 @@ impl Mirror {
         other.camera.at = glazing.mirrored(stage.camera.at);
         other.camera.axes = stage.camera.axes.map(|axis| glazing.turned(axis));
         // Only what is on the camera's side of the plane is mirrored.
-        let towards = mul(glazing.place.axes[2], -1.0);
+        let normal = glazing.place.axes[2];
+        let side = if dot(normal, sub(stage.camera.at, glazing.place.at)) > 0.0 { 1.0 } else { -1.0 };
+        let towards = mul(normal, side);
         let plane = (towards, dot(towards, glazing.place.at));
         let hits = cast_beyond(&other.solids, &other.camera, width, height, plane);
         let colour = shade(&mut other, &hits, width);
@@ -40,7 +42,7 @@ impl Mirror {
         for light in &stage.lights {
             let to = to_local(&glazing.place.axes, sub(light.at, glazing.place.at));
             white = add(white, mul(light.colour, 0.2));
-            if to[2] < 0.0 {
+            if side * to[2] > 0.0 {
                 // Where the line from the mirrored eye to the lamp crosses the plane.
                 let s = eye[2] / (eye[2] - to[2]);
                 let at = [0, 1].map(|k| eye[k] + s * (to[k] - eye[k]));

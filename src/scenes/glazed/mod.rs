@@ -1,8 +1,8 @@
 //! Rooms, halls and yards behind glass.
 //!
-//! A scene as [`procedural`](super::procedural) has them is parted by panes: partitions, doors, windows, balustrades, screens. They are tinted,
-//! mirror what is before them, are dirty or clean, and have frames, handles, stickers, most but not all of them. Depth is that of the
-//! pane, for a robot that drives on drives into it; what a sensor sees ([`Glass::sensed`]) is another map.
+//! A scene as [`procedural`](super::procedural) has them is parted by panes: partitions, doors, windows, balustrades, screens. They
+//! are tinted, mirror what is before them, are dirty or clean, and have frames, handles, stickers, most but not all of them. Depth
+//! is that of the pane, for a robot that drives on drives into it; what a sensor sees ([`Glass::sensed`]) is another map.
 
 mod build;
 mod glazing;

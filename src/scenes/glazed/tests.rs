@@ -122,7 +122,7 @@ fn panes_mirror_what_is_before_them_and_nothing_else() {
 
 #[test]
 fn what_a_pane_shows_is_what_is_behind_it_and_what_it_mirrors() {
-    let (mut stage, mut glazing) = before_a_pane([0.4, 1.0, -1.0]);
+    let (stage, mut glazing) = before_a_pane([0.4, 1.0, -1.0]);
     let s = &mut glazing.sheet;
     (s.tint, s.behind, s.dirt, s.frost, s.edges, s.shine) = ([1.0; 3], [1.0; 3], 0.0, None, false, 1.0);
     let mirror = Mirror::new(&stage, &glazing, 96, 72);
@@ -133,7 +133,7 @@ fn what_a_pane_shows_is_what_is_behind_it_and_what_it_mirrors() {
         assert_eq!(at.t, 2.0);
         mirror.seen(glazing, &at, pixel, 0.03, [0.5; 3])
     };
-    // Straight on a twelfth is reflected; aslant it is more, and past the ball the sky is mirrored.
+    // A twelfth is what the pane mirrors, the rest what is behind it.
     let plain = seen(&glazing, ball)[0];
     glazing.sheet.shine = 4.0;
     let shiny = seen(&glazing, ball)[0];
@@ -143,7 +143,33 @@ fn what_a_pane_shows_is_what_is_behind_it_and_what_it_mirrors() {
     assert!(green[1] > 1.3 * green[0], "{green:?}");
     glazing.cells[0].glass = false;
     assert_eq!(seen(&glazing, middle), [0.5; 3], "an opening shows what is behind it");
-    stage.solids.clear();
+}
+
+/// One pane fills the picture; what its sensing says is what a sensor has of it.
+#[test]
+fn a_sensor_has_of_a_pane_what_is_drawn_for_it() {
+    let (stage, mut glazing) = before_a_pane([0.4, 1.0, -1.0]);
+    (glazing.sheet.dirt, glazing.sheet.frost) = (0.0, None);
+    let hits = cast(&stage.solids, &stage.camera, 96, 72);
+    let glass = |change: &dyn Fn(&mut Glazing)| {
+        let mut glazing = glazing.clone();
+        let s = &mut glazing.sensing;
+        (s.pane, s.nothing, s.mirrored, s.glint) = (0.0, 0.0, 0.0, 2.0);
+        change(&mut glazing);
+        let (stage, hits) = (stage.clone(), hits.clone());
+        View { stage, glazings: vec![glazing], hits, size: (96, 72) }.photograph().glass.unwrap()
+    };
+    // The camera's scenes may be scaled as a whole after they were built.
+    let scale = glass(&|_| {}).behind[0] / hits.depth[0];
+    let at = 36 * 96 + 52;
+    let found = |change: &dyn Fn(&mut Glazing)| glass(change).sensed[at] / scale;
+    assert!((found(&|_| {}) - 6.0).abs() < 1e-3, "the wall");
+    assert!((found(&|g| g.sensing.pane = 1.0) - 2.0).abs() < 1e-3, "the pane");
+    assert!(found(&|g| g.sensing.nothing = 1.0).is_nan());
+    assert!((found(&|g| g.sensing.mirrored = 1.0) - 4.5).abs() < 0.02, "the ball in the mirror");
+    assert!((found(&|g| g.sensing.glint = -1.0) - 2.0).abs() < 1e-3, "seen straight on");
+    let open = glass(&|g| g.cells[0].glass = false);
+    assert!(!open.pane.contains(&true) && same(&open.sensed, &open.behind), "an opening is no pane");
 }
 
 #[test]
