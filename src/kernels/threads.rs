@@ -162,8 +162,8 @@ mod tests {
             "thread::scope",
             ".install(",
         ];
-        // A test and an example of `Latest` complete on a thread of their own, as its users do.
-        const KNOWN: [&str; 3] = ["kernels/threads.rs", "kernels/testing.rs", "stream/latest.rs"];
+        // A test and an example of `Latest` complete on a thread of their own, as its users do; a test of files writes one from several.
+        const KNOWN: [&str; 4] = ["kernels/threads.rs", "kernels/testing.rs", "stream/latest.rs", "files.rs"];
         let src = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("src");
         let (mut folders, mut found, mut files) = (vec![src.clone()], Vec::new(), 0);
         while let Some(folder) = folders.pop() {
