@@ -39,8 +39,13 @@ pub(crate) fn unknown_extension(path: &Path, extension: &str, expected: &str) ->
 
 /// Writes the bytes beside the target and renames them into place: on any error the target is as it was before.
 pub(crate) fn write_whole(path: &Path, bytes: &[u8]) -> Result<()> {
+    place_whole(path, |part| fs::write(part, bytes))
+}
+
+/// Lets `make` make a file beside the target, and renames it into place: on any error the target is as it was before.
+pub(crate) fn place_whole(path: &Path, make: impl FnOnce(&Path) -> std::io::Result<()>) -> Result<()> {
     let part = part_path(path)?;
-    let written = fs::write(&part, bytes).and_then(|()| fs::rename(&part, path));
+    let written = make(&part).and_then(|()| fs::rename(&part, path));
     if written.is_err() {
         // The first error is the one to report; the part file may not even exist.
         let _ = fs::remove_file(&part);
@@ -59,7 +64,7 @@ pub(crate) fn write_tensors<'a>(
 }
 
 /// Where the bytes of a file stand until they are whole: a name that no other process of this machine and no other thread writes to.
-pub(crate) fn part_path(path: &Path) -> Result<PathBuf> {
+fn part_path(path: &Path) -> Result<PathBuf> {
     static WRITTEN: AtomicU64 = AtomicU64::new(0);
     let Some(name) = path.file_name() else {
         return Err(Error::argument("path", path.display(), "a path that ends in a file name"));

@@ -145,14 +145,9 @@ fn main() -> anyhow::Result<()> {
     let args = Args::parse();
     let scale = DepthScale::millimetres();
     let library = args.library()?;
-    let mut sheet = args.sheet.as_ref().map(|_| {
-        sheet::Sheet::new(
-            args.count,
-            args.width,
-            args.height,
-            if args.recipe == Recipe::Glazed { 3 } else { 2 },
-        )
-    });
+    let pictures = if args.recipe == Recipe::Glazed { 3 } else { 2 };
+    let new_sheet = |_| sheet::Sheet::new(args.count, args.width, args.height, pictures);
+    let mut sheet = args.sheet.as_ref().map(new_sheet);
     for seed in args.seed..args.seed + args.count {
         let (frame, measured) = args.made(library.as_ref(), seed)?;
         if let Some(sheet) = &mut sheet {

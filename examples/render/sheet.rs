@@ -37,10 +37,11 @@ impl Sheet {
         for (x, y, _) in measured.into_iter().flat_map(SparseDepth::points) {
             depth.put_pixel(x as u32, y as u32, Rgb([255; 3]));
         }
-        let sensed = depth_to_rgb(frame.sensed(), w, h, near, far)?;
+        let sensed =
+            (self.pictures > 2).then(|| depth_to_rgb(frame.sensed(), w, h, near, far)).transpose()?;
         let first = self.next % self.across * self.pictures;
         let y = self.next / self.across * self.cell.1;
-        for (k, picture) in (0..self.pictures).zip([&frame.rgb, &depth, &sensed]) {
+        for (k, picture) in (0..).zip([&frame.rgb, &depth].into_iter().chain(&sensed)) {
             imageops::replace(&mut self.image, picture, ((first + k) * self.cell.0).into(), y.into());
         }
         self.next += 1;

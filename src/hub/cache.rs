@@ -10,7 +10,7 @@
 
 use super::names::is_commit;
 use crate::error::{Error, Result};
-use crate::files::{part_path, write_whole};
+use crate::files::{place_whole, write_whole};
 use std::fs::{self, File};
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
@@ -118,20 +118,14 @@ impl Repository {
     pub(super) fn link(&self, commit: &str, name: &str, etag: &str) -> Result<()> {
         let link = self.snapshot(commit).join(name);
         make_parent(&link)?;
-        let part = part_path(&link)?;
-        let place = |part: &Path| {
+        place_whole(&link, |part| {
             // A link that a crashed process with this id left here goes first: a copy would be written through it into the content.
             let _ = fs::remove_file(part);
             if symlink(&Path::new("../../blobs").join(etag), part).is_err() {
                 // Where links are not to be had, the content stands in both places.
                 fs::copy(self.blob(etag), part)?;
             }
-            fs::rename(part, &link)
-        };
-        place(&part).map_err(|e| {
-            // Its name is used once, so that no later call would take it up.
-            let _ = fs::remove_file(&part);
-            Error::io(&link)(e)
+            Ok(())
         })
     }
 }

@@ -93,14 +93,13 @@ impl Fetch<'_> {
         if self.is_here(dir, name)? {
             return Ok(());
         }
-        let listed = self.listing.files.get(name).copied().flatten();
         let commit = &self.listing.commit;
         let facts = self.client.facts(commit, name).map_err(|refusal| self.refused(name, refusal))?;
         if facts.commit != *commit {
             let reason = format!("the hub sent that of commit {}", facts.commit);
             return Err(self.hub.error(self.request, vec![name.into()], reason));
         }
-        let facts = Facts { size: facts.size.or(listed), ..facts };
+        let facts = Facts { size: facts.size.or(self.listed(name)), ..facts };
         let _lock = self.repository.lock(&facts.etag)?;
         // Who held the lock may have put it in place, and others read it there by now.
         if self.is_here(dir, name)? {
@@ -115,10 +114,14 @@ impl Fetch<'_> {
         self.repository.link(commit, name, &facts.etag)
     }
 
+    /// Bytes of a file, where the listing says so.
+    fn listed(&self, name: &str) -> Option<u64> {
+        self.listing.files.get(name).copied().flatten()
+    }
+
     /// Whether the snapshot has this file as the repository lists it.
     fn is_here(&self, dir: &Path, name: &str) -> Result<bool> {
-        let listed = self.listing.files.get(name).copied().flatten();
-        let here = cache::size(&dir.join(name));
+        let (listed, here) = (self.listed(name), cache::size(&dir.join(name)));
         Ok(here.is_some() && (listed.is_none() || here == listed) && is_whole(name, &dir.join(name))?)
     }
 

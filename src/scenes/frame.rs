@@ -29,6 +29,11 @@ pub struct Glass {
     pub sensed: Vec<f32>,
 }
 
+/// Depths of cast rays in metres, `scale` times as large as built; those that hit nothing are NaN.
+pub(super) fn metres(depths: &[f32], scale: f32) -> Vec<f32> {
+    depths.iter().map(|&t| if t.is_finite() { t * scale } else { f32::NAN }).collect()
+}
+
 impl RgbdFrame {
     /// Columns.
     pub fn width(&self) -> usize {

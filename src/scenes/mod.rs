@@ -50,7 +50,7 @@ pub fn procedural(seed: u64, width: usize, height: usize) -> Result<RgbdFrame> {
     let (mut stage, hits) = furnished_stage(seed, width, height)?;
     let rgb = picture(&mut stage, &hits, width, height);
     let scale = scale(&mut stage);
-    let depth = hits.depth.iter().map(|&t| if t.is_finite() { t * scale } else { f32::NAN }).collect();
+    let depth = frame::metres(&hits.depth, scale);
     Ok(RgbdFrame { rgb, depth, intrinsics: stage.camera.k, glass: None })
 }
 
@@ -93,7 +93,7 @@ pub fn street(seed: u64, width: usize, height: usize) -> Result<RgbdFrame> {
         (stage, hits) = ride(&mut rng, width, height);
     }
     let rgb = picture(&mut stage, &hits, width, height);
-    let depth = hits.depth.iter().map(|&t| if t.is_finite() { t } else { f32::NAN }).collect();
+    let depth = frame::metres(&hits.depth, 1.0);
     Ok(RgbdFrame { rgb, depth, intrinsics: stage.camera.k, glass: None })
 }
 

@@ -1,6 +1,7 @@
 //! One procedural scene, seen from many places.
 
 use super::camera::Camera;
+use super::frame::metres;
 use super::space::to_world;
 use super::stage::Stage;
 use super::{RgbdFrame, cast, furnished_stage, picture, scale};
@@ -49,13 +50,7 @@ impl Scene {
         }
         let hits = cast::cast(&stage.solids, &stage.camera, width, height);
         let rgb = picture(&mut stage, &hits, width, height);
-        let metres = |&t: &f32| if t.is_finite() { t * self.scale } else { f32::NAN };
-        RgbdFrame {
-            rgb,
-            depth: hits.depth.iter().map(metres).collect(),
-            intrinsics: stage.camera.k,
-            glass: None,
-        }
+        RgbdFrame { rgb, depth: metres(&hits.depth, self.scale), intrinsics: stage.camera.k, glass: None }
     }
 }
 

@@ -150,8 +150,8 @@ fn what_another_put_in_place_is_left_alone() {
             assert!(!waiting.is_finished(), "it ended without asking");
             std::thread::sleep(std::time::Duration::from_millis(5));
         }
-        let weights = whole.iter().filter(|(name, _)| *name == "model.safetensors");
-        let weights = weights.map(|(name, bytes)| (name.clone(), bytes.clone())).collect();
+        let mut weights = whole.clone();
+        weights.retain(|name, _| name == "model.safetensors");
         let weights = cached(dir.path(), &weights).join("model.safetensors");
         let place = || std::fs::symlink_metadata(&weights).unwrap().ino();
         let before = place();

@@ -73,14 +73,9 @@ impl Mirror {
                 colour = add(colour, mul(*light, 6.0 * bell * reflected / sheet.streak.sqrt()));
             }
         }
-        let cover = self.covered(glazing, at);
+        let cover = (dirt(glazing, at) + frost(glazing, at)).min(1.0);
         colour = mix(colour, mul(self.white, 0.55), cover);
         mix(colour, times(self.white, [0.1, 0.2, 0.16]), edge(glazing, at, footprint))
-    }
-
-    /// Share of a place that dirt or frost covers.
-    fn covered(&self, glazing: &Glazing, at: &Crossing) -> f32 {
-        (dirt(glazing, at) + frost(glazing, at)).min(1.0)
     }
 }
 

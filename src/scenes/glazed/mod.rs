@@ -10,11 +10,12 @@ mod look;
 mod sense;
 
 use super::cast::{Hits, cast};
-use super::frame::{Glass, RgbdFrame};
+use super::frame::{Glass, RgbdFrame, metres};
 use super::space::{add, dot, mul, sub};
 use super::stage::{Place, Stage};
 use super::{camera::Camera, check_size, empty, light, scale};
 use crate::depth::Intrinsics;
+use crate::depth::pixels::median;
 use crate::error::Result;
 use build::Room;
 use glazing::{Crossing, Glazing, Sensing, Sheet};
@@ -68,8 +69,7 @@ impl View {
         }
         let hits = cast(&stage.solids, &stage.camera, width, height);
         let mut far: Vec<f32> = hits.depth.iter().copied().filter(|t| t.is_finite()).collect();
-        let middle = far.len() / 2;
-        let far = if far.is_empty() { 4.0 } else { *far.select_nth_unstable_by(middle, f32::total_cmp).1 };
+        let far = median(&mut far).unwrap_or(4.0);
         let mut glazings = Vec::new();
         for _ in 0..if stage.chance(0.82) { 1 } else { 2 } {
             glazings.push(stand(&mut stage, far));
@@ -136,7 +136,7 @@ impl View {
         let rgb = light::develop(&mut self.stage, colour, width, height);
         let scale = scale(&mut self.stage);
         for map in [&mut depth, &mut glass.behind, &mut glass.sensed] {
-            map.iter_mut().for_each(|t| *t = if t.is_finite() { *t * scale } else { f32::NAN });
+            *map = metres(map, scale);
         }
         RgbdFrame { rgb, depth, intrinsics: self.stage.camera.k, glass: Some(glass) }
     }
