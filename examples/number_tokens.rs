@@ -54,6 +54,7 @@ impl Args {
                 position_scale: 1.0,
                 fusion: None,
                 glimpse: None,
+                wide_glimpse: None,
                 pixel_reference: PixelReference::Pointer { token: self.pointer.clone() },
                 number: NumberFormat::LogBins { bins: self.bins, lowest: self.lowest, highest: self.highest },
                 ..Settings::tiny()

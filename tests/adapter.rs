@@ -12,7 +12,7 @@ use std::path::Path;
 
 /// The way of asking of a base without fusion block.
 fn plain() -> Settings {
-    Settings { fusion: None, glimpse: None, ..Settings::tiny() }
+    Settings { fusion: None, glimpse: None, wide_glimpse: None, ..Settings::tiny() }
 }
 
 fn adapted() -> Settings {

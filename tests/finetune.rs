@@ -12,10 +12,9 @@ use common::program::program;
 use sdim::benchmarks::{Layout, LayoutOptions};
 use sdim::internals::model::SdimModel;
 use sdim::internals::supervise::{Example, PromptShard};
-use sdim::internals::vlm::qwen2_5::{crops::Picture, decoder::Keep, sequences::Sequences};
+use sdim::internals::vlm::qwen2_5::{decoder::Keep, sequences::Sequences};
 use sdim::settings::{LoraMode, Settings};
 use sdim::{Adapter, Error, LoadOptions, WeightFormat};
-use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
@@ -30,8 +29,8 @@ fn first_logits(model: &SdimModel, example: &Example) -> Tensor {
     let image = model.encode(&example.pixels, &scattered).unwrap();
     let prefix = &example.prefix;
     let embedded = model.vlm.embed_prompt(&prefix.ids, &image).unwrap();
-    let picture = Picture::new(Cow::Borrowed(&example.pixels.resized), &CPU).unwrap();
-    let embedded = model.add_glimpses(embedded, &[(&picture, &prefix.glimpses)]).unwrap();
+    let view = example.view(model).unwrap();
+    let embedded = model.add_glimpses(embedded, &[(&view, &prefix.glimpses)]).unwrap();
     let decoder = &model.vlm.decoder;
     let mut shared = decoder.cache(1);
     model.vlm.prefill(&embedded, &prefix.positions, &mut shared, Keep::Nothing).unwrap();
@@ -42,7 +41,7 @@ fn first_logits(model: &SdimModel, example: &Example) -> Tensor {
             // Without the tokens of the answer that stand behind the first.
             let asked = item.tokens.len() + 1 - item.supervised;
             let embedded = decoder.embed(&item.tokens.ids[..asked]).unwrap();
-            let group = (&picture, item.tokens.glimpses.as_slice());
+            let group = (&view, item.tokens.glimpses.as_slice());
             let embedded = model.add_glimpses(embedded, &[group]).unwrap();
             let positions = &item.tokens.positions[..asked];
             let one = Sequences::prefill(decoder, Some(&shared), &embedded, positions, vec![0.0]).unwrap();
@@ -138,8 +137,13 @@ fn the_settings_of_the_package_are_the_crates() {
         ..settings
     };
     assert_eq!(paper, added(&paper, Settings::paper()));
-    let asked =
-        Settings { rope_layout: rows.rope_layout, position_scale: 1.0, glimpse: None, ..Settings::tiny() };
+    let asked = Settings {
+        rope_layout: rows.rope_layout,
+        position_scale: 1.0,
+        glimpse: None,
+        wide_glimpse: None,
+        ..Settings::tiny()
+    };
     let (pixel_reference, number_tokens) = (rows.pixel_reference.clone(), rows.number_tokens);
     assert_eq!(rows, added(&rows, Settings { pixel_reference, number_tokens, ..asked }));
     assert!(rows.lora.is_some() && rows.lora == paper.lora && rows.fusion == paper.fusion);

@@ -14,10 +14,9 @@ use sdim::internals::supervise::{
     Asking, BatchConfig, BinLoss, Example, RecordConfig, RecordSet, SceneMix, Scenes, Shard, Target, VERSION,
     bins, example_of, frame, held_out_seed, training_seed,
 };
-use sdim::internals::vlm::qwen2_5::{crops::Picture, decoder::Keep, sequences::Sequences};
+use sdim::internals::vlm::qwen2_5::{decoder::Keep, sequences::Sequences};
 use sdim::settings::{Hint, NumberTokens, Settings};
 use sdim::{Error, LoadOptions, Result, WeightFormat};
-use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
@@ -67,8 +66,8 @@ fn logits(model: &SdimModel, example: &Example) -> Result<Tensor> {
     let scattered = Tensor::from_slice(&example.scattered, (1, h as usize, w as usize, 1), &Device::Cpu)?;
     let prefix = &example.prefix;
     let embedded = model.vlm.embed_prompt(&prefix.ids, &model.encode(&example.pixels, &scattered)?)?;
-    let picture = Picture::new(Cow::Borrowed(&example.pixels.resized), &model.device)?;
-    let embedded = model.add_glimpses(embedded, &[(&picture, &prefix.glimpses)])?;
+    let view = example.view(model)?;
+    let embedded = model.add_glimpses(embedded, &[(&view, &prefix.glimpses)])?;
     let decoder = &model.vlm.decoder;
     let mut shared = decoder.cache(1);
     model.vlm.prefill(&embedded, &prefix.positions, &mut shared, Keep::Nothing)?;
@@ -77,7 +76,7 @@ fn logits(model: &SdimModel, example: &Example) -> Result<Tensor> {
     let positions: Vec<_> = items.iter().flat_map(|i| i.tokens.positions.clone()).collect();
     let mut glimpses: Vec<_> = items.iter().map(|i| i.tokens.glimpses[0]).collect();
     glimpses.iter_mut().enumerate().for_each(|(i, g)| g.token = i);
-    let asked = model.add_glimpses(decoder.embed(&ids)?, &[(&picture, &glimpses)])?;
+    let asked = model.add_glimpses(decoder.embed(&ids)?, &[(&view, &glimpses)])?;
     let sequences = Sequences::prefill(decoder, Some(&shared), &asked, &positions, vec![0.0; items.len()])?;
     model.number_rows.linear(sequences.last(), None)
 }

@@ -54,7 +54,7 @@ impl Setup {
         let resized = (pixels.resized.width() as usize, pixels.resized.height() as usize);
         let (tokens, _) = model.prompts.prefix(&sparse, pixels.grid, resized, &model.vlm.config, 0).unwrap();
         let embedded = model.vlm.embed_prompt(&tokens.ids, &image_tokens).unwrap();
-        let embedded = model.add_glimpses(embedded, &[(&prefix.image, &tokens.glimpses)]).unwrap();
+        let embedded = model.add_glimpses(embedded, &[(&prefix.view, &tokens.glimpses)]).unwrap();
         assert_eq!(prefix.cache.len(), tokens.len());
         Self { model, prefix, embedded, positions: tokens.positions, sparse, text_tokens }
     }
@@ -81,7 +81,7 @@ impl Setup {
             .iter()
             .map(|s| {
                 let plain = self.model.vlm.decoder.embed(&s.ids).unwrap();
-                self.model.add_glimpses(plain, &[(&self.prefix.image, &s.glimpses)]).unwrap()
+                self.model.add_glimpses(plain, &[(&self.prefix.view, &s.glimpses)]).unwrap()
             })
             .collect();
         Tensor::cat(&embedded, 0).unwrap()

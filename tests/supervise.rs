@@ -225,7 +225,7 @@ fn running_statistics_are_measured_and_never_trained() {
 fn a_state_of_another_model_is_refused() {
     let [full, bare] = [(); 2].map(|()| tempfile::tempdir().unwrap());
     Trainer::new(small(), &Settings::tiny()).unwrap().save(full.path()).unwrap();
-    let settings = Settings { fusion: None, glimpse: None, ..Settings::tiny() };
+    let settings = Settings { fusion: None, glimpse: None, wide_glimpse: None, ..Settings::tiny() };
     Trainer::new(small(), &settings).unwrap().save(bare.path()).unwrap();
     let state = |dir: &Path| dir.join("trainer.safetensors");
     let good = std::fs::read(state(full.path())).unwrap();

@@ -15,9 +15,10 @@
 #       glazed=SHARE adds panes of glass that sensors see through
 #   HELD_MIX: mixes of the held-out sets, spaces between; procedural=1, and furnished=1 with furniture
 #   HELD_FRAMES=128  WAIT_FRAMES=1024  MAX_GB=30  SEED=7  GPUS and THREADS: all; PYTHON=python3; WORK: a temporary folder
-#   RECORDS_ARGS, TRAIN_ARGS, TRAIN_ARGS_MODEL: more arguments for the programs; INIT_MODEL: a checkpoint to start from
+#   RECORDS_ARGS, TRAIN_ARGS, TRAIN_ARGS_MODEL: more arguments for the programs; INIT_MODEL: a checkpoint to start from,
+#       what the shape has and it has not is initial
 #   FURNITURE (pack): folder of a furniture library, of which FURNITURE_MB=28 travel; EXTRA (pack): files and folders that the
-#   records need; MODELS and RECORDS_ARGS name them as @extra/NAME; TARGET_CPU=x86-64-v3 (pack)
+#   records need; MODELS, INIT_MODEL and RECORDS_ARGS name them as @extra/NAME; TARGET_CPU=x86-64-v3 (pack)
 set -euo pipefail
 here=$(cd "$(dirname "$0")" && pwd)
 
@@ -63,6 +64,11 @@ named() {
     basename "$1" .json
 }
 
+# A name as a part of a variable's.
+variable() {
+    echo "${1//[^A-Za-z0-9_]/_}"
+}
+
 # Writes records; what all sets share is in the array `common`.
 records() {
     "$pack/bin/records" "${common[@]}" ${extra[@]+"${extra[@]}"} "$@"
@@ -94,8 +100,8 @@ held_out() {
 
 # Trains one model; its number chooses the GPU where there are several.
 train() {
-    local name=$1 number=$2 launch=("$python" -m sdim_training.train) own init
-    own=TRAIN_ARGS_${name//[^A-Za-z0-9_]/_} init=INIT_${name//[^A-Za-z0-9_]/_}
+    local name=$1 number=$2 launch=("$python" -m sdim_training.train) own
+    own=TRAIN_ARGS_$(variable "$name")
     set +e
     if [ "${#models[@]}" -gt 1 ]; then
         [ "${gpus:-0}" -le 1 ] || export CUDA_VISIBLE_DEVICES=$((number % gpus))
@@ -109,7 +115,7 @@ train() {
         # The trainer itself ends in time; a signal makes it save and end, should it be late.
         # shellcheck disable=SC2086
         timeout --kill-after=4 --signal=TERM $((end - $(date +%s) - 12)) "${launch[@]}" --records "$work/train" \
-            --init "${!init:-$work/fresh/$name}" --out "$work/out/$name" --held-out "$work"/held/* --pictures "$work/pictures" \
+            --init "$work/fresh/$name" --out "$work/out/$name" --held-out "$work"/held/* --pictures "$work/pictures" \
             --follow --wait-frames "${WAIT_FRAMES:-1024}" --batch "${BATCH:-64}" --rate "${RATE:-1.5e-3}" \
             --seed "${SEED:-7}" --until $((end - 18)) ${TRAIN_ARGS:-} ${!own:-} $plain 2>&1 | tee -a "$work/logs/log-$name.txt"
         status=${PIPESTATUS[0]}
@@ -151,9 +157,12 @@ run() {
 
     common=(--size "${SIZE:-384x288}" --prompt "${PROMPT:-512}" --points "${POINTS:-40,1500}"
         --seed "${SEED:-7}" --threads "${THREADS:-$(nproc)}")
-    local settings=()
+    local settings=() init
     for shape in "${models[@]}"; do
-        records --shape "$shape" ${settings[@]+"${settings[@]}"} --fresh "$work/fresh/$(named "$shape")"
+        init=INIT_$(variable "$(named "$shape")")
+        init=${!init:-}
+        records --shape "$shape" ${settings[@]+"${settings[@]}"} --fresh "$work/fresh/$(named "$shape")" \
+            ${init:+--from "${init//@extra/$pack/extra}"}
         # All models ask in the way of the first one.
         settings=(--settings "$work/fresh/$(named "${models[0]}")/sdim.json")
     done

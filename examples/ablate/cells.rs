@@ -39,6 +39,7 @@ fn base() -> Settings {
         measurements: MeasurementPrompt::None,
         hint: Hint::None,
         glimpse: None,
+        wide_glimpse: None,
         number: NumberFormat::LogBins { bins: 512, lowest: 0.0625, highest: 16.0 },
         fusion: Some(FusionConfig { branch: 8, high: 16, low: 8 }),
         ..Settings::tiny()

@@ -90,6 +90,7 @@ fn shape() -> Shape {
             full_attention: vec![0, 2],
         },
         glimpse: None,
+        wide_glimpse: None,
         pixels: (SIZE.0 * SIZE.1, SIZE.0 * SIZE.1),
     }
 }

@@ -50,6 +50,9 @@ struct Args {
     /// Write a checkpoint with initial weights here.
     #[arg(long, required_unless_present_any = ["out", "list"])]
     fresh: Option<PathBuf>,
+    /// Checkpoint directory that the initial weights are taken from, those that it has in the same shape.
+    #[arg(long, requires = "fresh")]
+    from: Option<PathBuf>,
     /// Folder of the records.
     #[arg(long)]
     out: Option<PathBuf>,
@@ -166,9 +169,21 @@ fn fresh(args: &Args) -> anyhow::Result<FreshFiles> {
         None => shape.settings(),
     };
     let files = FreshFiles::of(&shape, &settings)?;
-    if let Some(dir) = &args.fresh {
-        files.write_initial(dir, args.seed)?;
-        eprintln!("{}: initial weights of seed {}", dir.display(), args.seed);
+    match (&args.fresh, &args.from) {
+        (Some(dir), Some(from)) => {
+            files.write_grown(dir, args.seed, from)?;
+            eprintln!(
+                "{}: weights of {}, the rest initial ones of seed {}",
+                dir.display(),
+                from.display(),
+                args.seed
+            );
+        }
+        (Some(dir), None) => {
+            files.write_initial(dir, args.seed)?;
+            eprintln!("{}: initial weights of seed {}", dir.display(), args.seed);
+        }
+        (None, _) => {}
     }
     Ok(files)
 }

@@ -10,6 +10,7 @@ use crate::model::{AskOptions, Prefix, SdimModel, ask};
 use crate::query::{ConfidenceScale, Hint, Query, Reading};
 use crate::refine::{Answered, FillInput, Filled, Sampling};
 use image::RgbImage;
+use std::borrow::Cow;
 
 /// Answers that lie at most so many pixels apart speak for the measurements between them, too.
 const CLOSE: usize = 4;
@@ -52,7 +53,7 @@ pub(super) struct Questions<'a> {
     flagged: &'a [(usize, usize, f32)],
     pub(super) options: &'a CompleteOptions,
     /// Linear interpolation of all measurements, metres; empty if the checkpoint takes no hint.
-    hint: Vec<f32>,
+    hint: Cow<'a, [f32]>,
     watch: &'a Watch,
 }
 
@@ -65,9 +66,10 @@ impl<'a> Questions<'a> {
         watch: &'a Watch,
     ) -> Result<Self> {
         let (prefix, sparse, flagged) = (&believed.prefix, &*believed.sparse, &*believed.flagged);
-        let hint = match model.prompts.settings().hint {
-            Hint::Linear => interpolate::linear(sparse)?,
-            Hint::None => Vec::new(),
+        let hint = match (model.prompts.settings().hint, &prefix.interpolated) {
+            (Hint::Linear, Some(known)) => Cow::Borrowed(known.as_slice()),
+            (Hint::Linear, None) => Cow::Owned(interpolate::linear(sparse)?),
+            (Hint::None, _) => Cow::Borrowed([].as_slice()),
         };
         Ok(Self { model, prefix, rgb, sparse, flagged, options, hint, watch })
     }
@@ -197,7 +199,7 @@ impl<'a> Questions<'a> {
         let (width, height) = self.size();
         let interpolated = match self.hint.is_empty() {
             true => &interpolate::linear(self.sparse)?,
-            false => &self.hint,
+            false => &*self.hint,
         };
         let input = FillInput { width, height, rgb: self.rgb, asked: &known, sparse: self.sparse };
         let pixel = width as f32 / self.prefix.space.resized.0.max(1) as f32;

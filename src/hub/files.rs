@@ -141,6 +141,7 @@ fn lacks(dir: &Path, tensors: &[String]) -> bool {
         (settings.fusion.is_some(), "sdim.fusion."),
         (settings.fusion.is_some(), "sdim.patch_embed."),
         (settings.glimpse.is_some(), "sdim.glimpse."),
+        (settings.wide_glimpse.is_some(), "sdim.wide_glimpse."),
         (settings.lora.is_some(), ".lora_"),
     ];
     parts.iter().any(|(asked, part)| *asked && !tensors.iter().any(|t| published_name(t).contains(part)))

@@ -4,6 +4,7 @@ use super::batch::Batch;
 use super::generate::{FreeAnswer, TokenChooser};
 use super::prefix::Prefix;
 use super::sdim_model::SdimModel;
+use super::wide_glimpse::WIDE_CHANNELS;
 use crate::error::{Error, Result};
 use crate::kernels;
 use crate::query::Query;
@@ -92,7 +93,9 @@ fn rows_within(model: &SdimModel, prefix: &Prefix, max_memory: Option<usize>) ->
     // So many values of each bin are there while its statistics are found.
     let read = 8 * model.number_rows.dims().0;
     // Crops are cut before the pass.
-    let cut = model.prompts.settings().glimpse.map_or(0, bytes_per_crop);
+    let settings = model.prompts.settings();
+    let channels = 3 + settings.wide_glimpse.map_or(0, |_| WIDE_CHANNELS);
+    let cut = settings.glimpse.map_or(0, |side| bytes_per_crop(side, channels));
     let bytes = ((passing + kept + scores + read).max(1) * size_of::<f32>()).max(cut);
     (max_memory.unwrap_or(DEVICE_BYTES) / bytes).clamp(1, DEVICE_ROWS)
 }

@@ -51,7 +51,7 @@ impl<'a> Batch<'a> {
                 model.vlm.embed_prompt(&ids, &marked.encode(model, &pixels)?)?
             }
         };
-        let embedded = model.add_glimpses(embedded, &[(&prefix.image, &glimpses)])?;
+        let embedded = model.add_glimpses(embedded, &[(&prefix.view, &glimpses)])?;
         let next = suffixes.iter().map(|s| s.next_text(&prefix.space)).collect();
         let shared = Some(&prefix.cache);
         let sequences = Sequences::prefill(&model.vlm.decoder, shared, &embedded, &positions, next)?;

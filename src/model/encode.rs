@@ -1,13 +1,14 @@
 //! From a frame to image tokens (Eq. 1-3).
 
 use super::sdim_model::SdimModel;
+use super::view::View;
 use crate::depth::SparseDepth;
 use crate::error::{Error, Result};
 use crate::fusion::Normalise;
 use crate::kernels;
 use crate::query::prompt::Glimpse;
 use crate::vlm::qwen2_5::Interrupt;
-use crate::vlm::qwen2_5::crops::{Picture, joined};
+use crate::vlm::qwen2_5::crops::joined;
 use crate::vlm::qwen2_5::grid::Grid;
 use crate::vlm::qwen2_5::preprocess::Pixels;
 use candle_core::Tensor;
@@ -86,12 +87,12 @@ impl SdimModel {
         Ok(embedded)
     }
 
-    /// Adds the crop around its pixel to each token that stands at one; `groups` pairs pictures with the tokens that stand
+    /// Adds the crops around its pixel to each token that stands at one; `groups` pairs frames with the tokens that stand
     /// in them, indices counting over all of `embedded`. Without a glimpse layer nothing changes.
     ///
     /// # Errors
     /// [`Error::Tensors`] if an index is out of range.
-    pub fn add_glimpses(&self, embedded: Tensor, groups: &[(&Picture, &[Glimpse])]) -> Result<Tensor> {
+    pub fn add_glimpses(&self, embedded: Tensor, groups: &[(&View, &[Glimpse])]) -> Result<Tensor> {
         let (Some(layer), Some(side)) = (&self.glimpse, self.prompts.settings().glimpse) else {
             return Ok(embedded);
         };
@@ -100,11 +101,14 @@ impl SdimModel {
         if rows.is_empty() {
             return Ok(embedded);
         }
-        let crops = groups.iter().filter(|(_, list)| !list.is_empty()).map(|(picture, list)| {
-            let places: Vec<(f32, f32)> = list.iter().map(|g| (g.x, g.y)).collect();
-            picture.crops(&self.preprocessor, &places, side)
-        });
-        let added = layer.forward(&joined(crops.collect::<Result<Vec<_>>>()?)?)?;
+        let seen = || groups.iter().filter(|(_, list)| !list.is_empty());
+        let crops = seen().map(|(view, list)| view.crops(&self.preprocessor, list, side));
+        let crops = joined(crops.collect::<Result<Vec<_>>>()?)?;
+        let mut added = layer.forward(&crops)?;
+        if let Some(wide) = &self.wide_glimpse {
+            let wider = seen().map(|(view, list)| view.wide_crops(list, side)).collect::<Result<Vec<_>>>()?;
+            added = kernels::add(&added, &wide.forward(&crops, &joined(wider)?)?)?;
+        }
         if rows.len() == embedded.dim(0)? && (0..).zip(&rows).all(|(i, &row)| row == i) {
             return kernels::add(&embedded, &added);
         }
@@ -118,10 +122,11 @@ impl SdimModel {
 pub fn scatter(sparse: &SparseDepth, width: usize, height: usize, seen: impl Fn(f32) -> f32) -> Vec<f32> {
     let mut out = vec![0f32; width * height];
     let mut off = vec![f32::MAX; width * height];
-    let (sx, sy) = (width as f32 / sparse.width() as f32, height as f32 / sparse.height() as f32);
+    let (from, to) = ((sparse.width(), sparse.height()), (width, height));
     for (x, y, depth) in sparse.points() {
-        let (fx, fy) = ((x as f32 + 0.5) * sx, (y as f32 + 0.5) * sy);
-        let at = (fy as usize).min(height - 1) * width + (fx as usize).min(width - 1);
+        let (fx, fy) = resized_centre((x, y), from, to);
+        let (column, row) = pixel_of((x, y), from, to);
+        let at = row * width + column;
         let distance = (fx.fract() - 0.5).powi(2) + (fy.fract() - 0.5).powi(2);
         if distance < off[at] {
             off[at] = distance;
@@ -129,4 +134,16 @@ pub fn scatter(sparse: &SparseDepth, width: usize, height: usize, seen: impl Fn(
         }
     }
     out
+}
+
+/// Where the centre of a frame's pixel falls in the resized frame, from the upper left corner of its first pixel.
+fn resized_centre((x, y): (usize, usize), from: (usize, usize), to: (usize, usize)) -> (f32, f32) {
+    let (sx, sy) = (to.0 as f32 / from.0 as f32, to.1 as f32 / from.1 as f32);
+    ((x as f32 + 0.5) * sx, (y as f32 + 0.5) * sy)
+}
+
+/// The pixel of the resized frame in which the centre of a frame's pixel falls.
+pub(super) fn pixel_of(at: (usize, usize), from: (usize, usize), to: (usize, usize)) -> (usize, usize) {
+    let (x, y) = resized_centre(at, from, to);
+    ((x as usize).min(to.0 - 1), (y as usize).min(to.1 - 1))
 }

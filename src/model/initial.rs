@@ -43,6 +43,7 @@ pub fn initial(
             || name.starts_with("sdim.fusion.depth.conv")
             || name.starts_with("sdim.fusion.out")
             || name.starts_with("sdim.glimpse")
+            || name.starts_with("sdim.wide_glimpse.down")
             || name.contains(".lora_B.")
         {
             0.0

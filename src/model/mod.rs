@@ -18,6 +18,8 @@ mod parts;
 mod peft;
 mod prefix;
 mod sdim_model;
+mod view;
+mod wide_glimpse;
 
 pub use adapter::Adapter;
 pub use ask::{AskOptions, ask, generate};
@@ -33,3 +35,5 @@ pub(crate) use load::{TINY, tiny_weights};
 pub use parts::DepthInjection;
 pub use prefix::{Encoded, Prefix};
 pub use sdim_model::SdimModel;
+pub use view::View;
+pub use wide_glimpse::{CELL, WideGlimpse, at_cells};

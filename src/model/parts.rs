@@ -1,6 +1,7 @@
 //! Everything of a model that has weights.
 
 use super::files::SETTINGS;
+use super::wide_glimpse::WideGlimpse;
 use crate::error::{Error, Result};
 use crate::fusion::Fusion;
 use crate::query::{NumberTokens, Settings};
@@ -23,6 +24,7 @@ pub(crate) struct Parts {
     pub(crate) vlm: QwenVl,
     pub(crate) injection: Option<DepthInjection>,
     pub(crate) glimpse: Option<Linear>,
+    pub(crate) wide_glimpse: Option<WideGlimpse>,
 }
 
 impl Parts {
@@ -42,12 +44,16 @@ impl Parts {
             None => None,
         };
         let hidden = config.text.hidden_size;
+        let wide_glimpse = match (settings.glimpse, settings.wide_glimpse) {
+            (Some(side), Some(inner)) => Some(WideGlimpse::new(weights, side, inner, &config)?),
+            _ => None,
+        };
         let mut vlm = QwenVl::new(config, weights, settings.rope_layout)?;
         if let Some(bins) = settings.number.bins().filter(|_| settings.number_tokens == NumberTokens::Rows) {
             check_number_rows(weights, bins.count, hidden)?;
             vlm.decoder.add_tokens(weights, NumberTokens::NAME, bins.count)?;
         }
-        Ok(Self { vlm, injection, glimpse })
+        Ok(Self { vlm, injection, glimpse, wide_glimpse })
     }
 }
 

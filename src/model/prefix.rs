@@ -1,15 +1,17 @@
 //! From a frame to what all of its queries share.
 
+use super::encode::pixel_of;
 use super::marked::MarkedFrame;
 use super::sdim_model::SdimModel;
-use crate::depth::SparseDepth;
+use super::view::View;
+use super::wide_glimpse::at_cells;
+use crate::depth::{SparseDepth, interpolate};
 use crate::error::Result;
 use crate::kernels;
 use crate::query::prompt::FrameSpace;
 use crate::query::settings::PixelReference;
 use crate::vlm::qwen2_5::Interrupt;
 use crate::vlm::qwen2_5::cache::KvCache;
-use crate::vlm::qwen2_5::crops::Picture;
 use crate::vlm::qwen2_5::decoder::Keep;
 use crate::vlm::qwen2_5::preprocess::Pixels;
 use candle_core::Tensor;
@@ -24,8 +26,10 @@ pub struct Prefix {
     pub ids: Vec<u32>,
     /// Where pixels lie, and what numbers mean.
     pub space: FrameSpace,
-    /// The resized frame, for the crops around pixels.
-    pub image: Picture<'static>,
+    /// What tokens at pixels see of the frame.
+    pub view: View<'static>,
+    /// Linear interpolation of the measurements at each pixel of the frame, metres, where the checkpoint's wide crops need it.
+    pub interpolated: Option<Vec<f32>>,
     /// The frame that each query marks for itself, for [`PixelReference::Marker`].
     pub marked: Option<MarkedFrame>,
 }
@@ -101,8 +105,9 @@ impl SdimModel {
             let embedded = self.vlm.decoder.embed(&shared.ids)?;
             self.vlm.prefill_unless(&embedded, &shared.positions, &mut cache, Keep::Nothing, interrupt)?;
         }
-        let image = self.picture(pixels)?;
-        Ok(Prefix { cache, ids: shared.ids, space, image, marked: Some(frame.with_opening(opening)) })
+        let (view, interpolated) = self.view(pixels, sparse, space.unit)?;
+        let marked = Some(frame.with_opening(opening));
+        Ok(Prefix { cache, ids: shared.ids, space, view, interpolated, marked })
     }
 
     /// Reads the shared prefix of a frame into a cache, for pixel references that leave the image as it is.
@@ -127,15 +132,30 @@ impl SdimModel {
     ) -> Result<Prefix> {
         let resized = (pixels.resized.width() as usize, pixels.resized.height() as usize);
         let (tokens, space) = self.prompts.prefix(sparse, pixels.grid, resized, &self.vlm.config, 0)?;
-        let image = self.picture(pixels)?;
+        let (view, interpolated) = self.view(pixels, sparse, space.unit)?;
         let embedded = self.vlm.embed_prompt(&tokens.ids, image_tokens)?;
-        let embedded = self.add_glimpses(embedded, &[(&image, &tokens.glimpses)])?;
+        let embedded = self.add_glimpses(embedded, &[(&view, &tokens.glimpses)])?;
         let mut cache = self.vlm.decoder.cache(1);
         self.vlm.prefill_unless(&embedded, &tokens.positions, &mut cache, Keep::Nothing, interrupt)?;
-        Ok(Prefix { cache, ids: tokens.ids, space, image, marked: None })
+        Ok(Prefix { cache, ids: tokens.ids, space, view, interpolated, marked: None })
     }
 
-    fn picture(&self, pixels: &Pixels) -> Result<Picture<'static>> {
-        Picture::new(Cow::Owned(pixels.resized.clone()), &self.device)
+    /// What tokens at pixels see of a frame, and the interpolation of its measurements if that is a part of it.
+    fn view(
+        &self,
+        pixels: &Pixels,
+        sparse: &SparseDepth,
+        unit: f32,
+    ) -> Result<(View<'static>, Option<Vec<f32>>)> {
+        let image = Cow::Owned(pixels.resized.clone());
+        if self.wide_glimpse.is_none() {
+            return Ok((View::new(self, image, &[], [])?, None));
+        }
+        let (frame, resized) = ((sparse.width(), sparse.height()), image.dimensions());
+        let resized = (resized.0 as usize, resized.1 as usize);
+        let dense = interpolate::linear(sparse)?;
+        let cells = at_cells(&dense, frame, resized, unit);
+        let measured = sparse.points().map(|(x, y, _)| pixel_of((x, y), frame, resized));
+        Ok((View::new(self, image, &cells, measured)?, Some(dense)))
     }
 }

@@ -2,6 +2,7 @@
 
 use super::files::CheckpointFiles;
 use super::parts::{DepthInjection, Parts};
+use super::wide_glimpse::WideGlimpse;
 use crate::error::Result;
 use crate::query::PromptWriter;
 use crate::system;
@@ -22,6 +23,8 @@ pub struct SdimModel {
     pub injection: Option<DepthInjection>,
     /// Crops around pixels to token embeddings, zero-initialised; `None` for a checkpoint without it.
     pub glimpse: Option<Linear>,
+    /// Wide crops around pixels to token embeddings; `None` for a checkpoint without it.
+    pub wide_glimpse: Option<WideGlimpse>,
     /// How frames are resized and normalised.
     pub preprocessor: PreprocessorConfig,
     /// How it is asked.
@@ -49,13 +52,14 @@ impl SdimModel {
         let CheckpointFiles { config, preprocessor, settings, tokenizer, stop_ids } = files;
         check_patches(&preprocessor, &config)?;
         let prompts = PromptWriter::new(&settings, &tokenizer)?;
-        let Parts { vlm, injection, glimpse } = Parts::new(config, &settings, weights)?;
+        let Parts { vlm, injection, glimpse, wide_glimpse } = Parts::new(config, &settings, weights)?;
         weights.finish()?;
         let number_rows = vlm.decoder.head_of(&prompts.numbers().ids, weights.format())?;
         Ok(Self {
             vlm,
             injection,
             glimpse,
+            wide_glimpse,
             preprocessor,
             prompts,
             tokenizer,

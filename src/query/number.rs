@@ -207,6 +207,16 @@ impl Numbers {
         }
     }
 
+    /// The number that one token states: the middle of its bin. NaN for a digit, which states none, and for any other token.
+    pub fn stated(&self, id: u32) -> f32 {
+        let Some(bins) = self.format.bins() else { return f32::NAN };
+        // They follow each other in all vocabularies but odd ones.
+        let guess = self.ids.first().and_then(|first| id.checked_sub(*first)).map(|k| k as usize);
+        let guess = guess.filter(|&k| self.ids.get(k) == Some(&id));
+        let bin = guess.or_else(|| self.ids.iter().position(|&own| own == id));
+        bin.map_or(f32::NAN, |k| bins.number(k as f32 + 0.5))
+    }
+
     /// Like [`Numbers::write`], as token ids.
     pub fn write_ids(&self, value: f32) -> Vec<u32> {
         self.write(value).into_iter().map(|i| self.ids[i]).collect()

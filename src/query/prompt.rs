@@ -31,6 +31,8 @@ pub struct Glimpse {
     pub x: f32,
     /// Row in the resized image, fractional.
     pub y: f32,
+    /// What the token says of the pixel's depth, in number units; NaN if it states no number.
+    pub stated: f32,
 }
 
 impl Tokens {
@@ -52,11 +54,19 @@ impl Tokens {
     }
 
     /// Tokens that say a number at a pixel; the first one carries the crop.
-    pub(crate) fn push_at(&mut self, ids: &[u32], (x, y): (usize, usize), time: f32, space: &FrameSpace) {
+    pub(crate) fn push_at(
+        &mut self,
+        ids: &[u32],
+        numbers: &Numbers,
+        (x, y): (usize, usize),
+        time: f32,
+        space: &FrameSpace,
+    ) {
         self.glimpses.push(Glimpse {
             token: self.len(),
             x: centre(x, space.width, space.resized.0),
             y: centre(y, space.height, space.resized.1),
+            stated: ids.first().map_or(f32::NAN, |&id| numbers.stated(id)),
         });
         let position = space.pixel(x, y, time);
         ids.iter().for_each(|&id| self.push(id, position));
@@ -273,7 +283,8 @@ impl PromptWriter {
         };
         if let MeasurementPrompt::Prefix { max } = self.settings.measurements {
             for (x, y, depth) in told(sparse, self.settings.unit, max.min(points), seed) {
-                tokens.push_at(&self.numbers.write_ids(depth / space.unit), (x, y), MEASURED_TIME, &space);
+                let ids = self.numbers.write_ids(depth / space.unit);
+                tokens.push_at(&ids, &self.numbers, (x, y), MEASURED_TIME, &space);
             }
         }
         Ok((tokens, space))
@@ -314,7 +325,7 @@ impl PromptWriter {
                         super::Hint::Linear => self.numbers.write_ids(query.hint / space.unit),
                         super::Hint::None => self.pointer.into_iter().collect(),
                     };
-                    out.push_at(&ids, (query.x, query.y), QUERY_TIME, space);
+                    out.push_at(&ids, &self.numbers, (query.x, query.y), QUERY_TIME, space);
                 }
             }
         }

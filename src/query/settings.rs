@@ -80,6 +80,11 @@ pub struct Settings {
     /// pixel; `null` for none.
     #[serde(default)]
     pub glimpse: Option<usize>,
+    /// Width of the hidden layer through which each token at a pixel also sees a crop as many cells wide of the frame at a quarter of its
+    /// size, with the interpolated depth relative to the number that the token states, and where measurements are; `null` for none. It
+    /// needs a crop (`glimpse`), a hint, and numbers that are bins of equal ratio.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub wide_glimpse: Option<usize>,
     /// How numbers are written.
     pub number: NumberFormat,
     /// Where the tokens of numbers that are bins come from.
@@ -129,6 +134,7 @@ impl Settings {
             measurements: MeasurementPrompt::PerQuery,
             hint: Hint::None,
             glimpse: None,
+            wide_glimpse: None,
             number: NumberFormat::Digits { decimals: 3, integers: 3 },
             number_tokens: NumberTokens::Vocabulary,
             unit: DepthUnit::Metres,
@@ -181,6 +187,7 @@ impl Settings {
             measurements: MeasurementPrompt::Prefix { max: 1024 },
             hint: Hint::Linear,
             glimpse: Some(12),
+            wide_glimpse: Some(256),
             number: NumberFormat::LogBins { bins: 1000, lowest: 0.0625, highest: 16.0 },
             number_tokens: NumberTokens::Vocabulary,
             unit: DepthUnit::FrameMedian,
@@ -277,6 +284,7 @@ impl Settings {
                 "a side of 1 to 64 pixels",
             ));
         }
+        self.validate_wide_glimpse(file)?;
         if let Some(lora) = &self.lora {
             lora.validate(file)?;
         }
@@ -291,6 +299,22 @@ impl Settings {
     /// Whether an answer mode is right by itself and goes with these settings; `file` is for messages.
     pub(crate) fn validate_mode(&self, file: &str, mode: &AnswerMode) -> Result<()> {
         mode.validate(file, self.number, self.unit, &self.template)
+    }
+
+    fn validate_wide_glimpse(&self, file: &str) -> Result<()> {
+        let Some(hidden) = self.wide_glimpse else { return Ok(()) };
+        let wrong = |expected: &str| Err(Error::config(file, "wide_glimpse", hidden.to_string(), expected));
+        let pointed = matches!(self.pixel_reference, PixelReference::Pointer { .. });
+        if !(1..=4096).contains(&hidden) {
+            return wrong("1 to 4096 hidden values");
+        }
+        if self.glimpse.is_none() {
+            return wrong("none without a `glimpse`");
+        }
+        if !(pointed && self.hint == Hint::Linear && matches!(self.number, NumberFormat::LogBins { .. })) {
+            return wrong("none unless a pointer states its hint, in `log_bins`");
+        }
+        Ok(())
     }
 
     fn validate_reference(&self, file: &str) -> Result<()> {

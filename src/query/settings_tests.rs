@@ -51,7 +51,11 @@ fn a_file_may_name_presets_and_change_them() {
 #[test]
 fn what_is_wrong_is_named() {
     type Change = fn(&mut Value);
-    let cases: [(Settings, Change, &str); 19] = [
+    let cases: [(Settings, Change, &str); 23] = [
+        (Settings::tiny(), |j| j["wide_glimpse"] = 0.into(), "wide_glimpse"),
+        (Settings::tiny(), |j| j["glimpse"] = Value::Null, "wide_glimpse"),
+        (Settings::tiny(), |j| j["hint"] = "none".into(), "wide_glimpse"),
+        (Settings::paper(), |j| j["wide_glimpse"] = 64.into(), "wide_glimpse"),
         (
             Settings::tiny(),
             |j| j["confidence"] = serde_json::json!({"temperature": 0, "offset": 0}),

@@ -5,9 +5,9 @@ use super::measure::{measure, spoil};
 use super::mix::Scenes;
 use super::recipe::{BatchConfig, LabelSource};
 use crate::depth::SparseDepth;
-use crate::depth::interpolate::Interpolator;
+use crate::depth::interpolate::{self, Interpolator};
 use crate::error::{Error, Result};
-use crate::model::{SdimModel, scatter};
+use crate::model::{SdimModel, View, at_cells, scatter};
 use crate::query::prompt::Tokens;
 use crate::query::{DepthUnit, PromptWriter, Query};
 use crate::scenes::RgbdFrame;
@@ -21,6 +21,7 @@ use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 use rayon::prelude::*;
+use std::borrow::Cow;
 
 /// One frame's part of a batch.
 pub struct Example {
@@ -28,6 +29,8 @@ pub struct Example {
     pub pixels: Pixels,
     /// Scattered measurements as the fusion block sees them, row-major.
     pub scattered: Vec<f32>,
+    /// What interpolation gives at the middle of each cell of [`crate::model::CELL`] pixels a side, in number units, row-major.
+    pub interpolated: Vec<f32>,
     /// Metres per number unit.
     pub unit: f32,
     /// The shared prefix.
@@ -40,6 +43,16 @@ impl Example {
     /// Pixels with a measurement, by their place in the frame, and what the fusion block sees of it.
     pub(super) fn measured(&self) -> impl Iterator<Item = (u32, f32)> + '_ {
         (0u32..).zip(self.scattered.iter().copied()).filter(|(_, value)| *value != 0.0)
+    }
+
+    /// What tokens at its pixels see of the frame.
+    ///
+    /// # Errors
+    /// [`Error::Tensors`] if the device refuses it.
+    pub fn view(&self, model: &SdimModel) -> Result<View<'_>> {
+        let width = self.pixels.resized.width() as usize;
+        let measured = self.measured().map(|(pixel, _)| (pixel as usize % width, pixel as usize / width));
+        View::new(model, Cow::Borrowed(&self.pixels.resized), &self.interpolated, measured)
     }
 
     /// What the frame's errors are counted in, as in its [`Item::scale`]; 1 without a question.
@@ -283,7 +296,9 @@ pub(super) fn written_on(
     }
     items.sort_by_key(|i| i.tokens.len());
     let scattered = scatter(prompted, resized.0, resized.1, |depth| writer.seen(depth, space.unit));
-    Ok(Example { pixels, scattered, unit: space.unit, prefix, items })
+    let dense = interpolate::linear(prompted)?;
+    let interpolated = at_cells(&dense, (width, height), resized, space.unit);
+    Ok(Example { pixels, scattered, interpolated, unit: space.unit, prefix, items })
 }
 
 /// Mirrors, drops the colour or mixes the channels of a frame.

@@ -14,6 +14,9 @@ use serde_json::Value;
 use std::collections::BTreeMap;
 use std::path::Path;
 
+/// Where the weights of a small checkpoint are.
+const WEIGHTS: &str = "model.safetensors";
+
 /// The JSON files of a checkpoint, as text.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FreshFiles {
@@ -99,7 +102,36 @@ impl FreshFiles {
     /// As [`FreshFiles::initial`]; [`Error::Io`].
     pub fn write_initial(&self, dir: &Path, seed: u64) -> Result<()> {
         self.write(dir)?;
-        write_tensors(&dir.join("model.safetensors"), &self.initial(seed)?)
+        write_tensors(&dir.join(WEIGHTS), &self.initial(seed)?)
+    }
+
+    /// As [`FreshFiles::write_initial`], with all tensors that a checkpoint directory has in the same shape from there: where the
+    /// training of a model goes on that has grown a part.
+    ///
+    /// # Errors
+    /// As [`FreshFiles::write_initial`]; [`Error::Format`] if its weights cannot be read; [`Error::Argument`] if it has none of the tensors.
+    pub fn write_grown(&self, dir: &Path, seed: u64, from: &Path) -> Result<()> {
+        let path = from.join(WEIGHTS);
+        let bytes = std::fs::read(&path).map_err(Error::io(&path))?;
+        let old = candle_core::safetensors::load_buffer(&bytes, &Device::Cpu)
+            .map_err(|e| Error::format(&path, e.to_string(), "tensors in safetensors"))?;
+        let mut tensors = self.initial(seed)?;
+        let mut found = 0;
+        for (name, tensor) in &mut tensors {
+            if let Some(known) = old.get(name).filter(|known| known.dims() == tensor.dims()) {
+                *tensor = known.to_dtype(candle_core::DType::F32)?;
+                found += 1;
+            }
+        }
+        if found == 0 {
+            return Err(Error::argument(
+                "checkpoint to start from",
+                from.display(),
+                "the directory of a small checkpoint",
+            ));
+        }
+        self.write(dir)?;
+        write_tensors(&dir.join(WEIGHTS), &tensors)
     }
 
     /// Reads them from a checkpoint directory.

@@ -94,6 +94,7 @@ impl RecordConfig {
                 !matches!(s.pixel_reference, PixelReference::Marker(_)),
                 "a pointer, or coordinates",
             ),
+            ("wide_glimpse", s.wide_glimpse.is_none(), "none: wide crops are trained with records"),
             (
                 "answer_mode",
                 s.answer_mode == AnswerMode::Digits,

@@ -6,12 +6,10 @@ use crate::fusion::Normalise;
 use crate::kernels::{self, Block};
 use crate::model::SdimModel;
 use crate::query::prompt::{Glimpse, Tokens};
-use crate::vlm::qwen2_5::crops::Picture;
 use crate::vlm::qwen2_5::decoder::Context;
 use crate::vlm::qwen2_5::preprocess::Pixels;
 use crate::vlm::qwen2_5::rope::Position;
 use candle_core::{Device, Tensor};
-use std::borrow::Cow;
 
 /// Logits of the number rows at each supervised token of all examples, `[supervised, numbers]`: the questions of an example
 /// one after the other, and all examples packed into one sequence of tokens.
@@ -20,9 +18,8 @@ pub(super) fn logits(model: &SdimModel, examples: &[Example], normalise: Normali
     let decoder = &model.vlm.decoder;
     let packed = Packed::new(examples);
     let embedded = model.vlm.embed_prompt(&packed.ids, &image_tokens)?;
-    let pictures = examples.iter().map(|e| Picture::new(Cow::Borrowed(&e.pixels.resized), &model.device));
-    let pictures = pictures.collect::<Result<Vec<_>>>()?;
-    let groups: Vec<_> = pictures.iter().zip(&packed.glimpses).map(|(p, g)| (p, g.as_slice())).collect();
+    let views = examples.iter().map(|e| e.view(model)).collect::<Result<Vec<_>>>()?;
+    let groups: Vec<_> = views.iter().zip(&packed.glimpses).map(|(v, g)| (v, g.as_slice())).collect();
     let embedded = model.add_glimpses(embedded, &groups)?;
     let table = decoder.rope().table(&packed.positions, &Device::Cpu)?;
     let layout = decoder.layout(packed.blocks);

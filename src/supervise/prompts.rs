@@ -118,7 +118,7 @@ impl Runs {
         for (token, place) in self.place[begin * PLACE..end * PLACE].chunks_exact(PLACE).enumerate() {
             tokens.positions.push(Position { t: place[0], h: place[1], w: place[2] });
             if place[3].is_finite() {
-                tokens.glimpses.push(Glimpse { token, x: place[3], y: place[4] });
+                tokens.glimpses.push(Glimpse { token, x: place[3], y: place[4], stated: f32::NAN });
             }
         }
         tokens
@@ -330,6 +330,8 @@ impl PromptShard {
         Ok(Example {
             pixels,
             scattered,
+            // Whoever has wide crops is asked by records, not by prompts.
+            interpolated: Vec::new(),
             unit: self.unit[at],
             prefix: self.prefix.tokens(at),
             items: items.collect(),

@@ -29,6 +29,9 @@ pub struct Shape {
     pub vision: VisionShape,
     /// Side of the crop at tokens that stand at a pixel, pixels; `null` for none. [`Shape::settings`] takes it over.
     pub glimpse: Option<usize>,
+    /// Width of the layer behind the wide crop; `null` for none. [`Shape::settings`] takes it over.
+    #[serde(default)]
+    pub wide_glimpse: Option<usize>,
     /// Frames are resized to at least and at most so many pixels.
     pub pixels: (usize, usize),
 }
@@ -55,7 +58,7 @@ impl Shape {
     /// Names of the shapes that have one.
     pub const NAMES: [&str; 2] = ["tiny", "small"];
 
-    /// About 3.6 million parameters, images of at most 110,592 pixels (384x288).
+    /// About 4 million parameters, images of at most 110,592 pixels (384x288).
     pub fn tiny() -> Self {
         Self {
             hidden_size: 192,
@@ -72,11 +75,12 @@ impl Shape {
                 full_attention: vec![1, 3, 5],
             },
             glimpse: Some(12),
+            wide_glimpse: Some(256),
             pixels: (16_384, 110_592),
         }
     }
 
-    /// About 9.7 million parameters, images of at most 110,592 pixels (384x288).
+    /// About 10 million parameters, images of at most 110,592 pixels (384x288).
     pub fn small() -> Self {
         Self {
             hidden_size: 288,
@@ -93,6 +97,7 @@ impl Shape {
                 full_attention: (0..6).collect(),
             },
             glimpse: Some(12),
+            wide_glimpse: Some(256),
             pixels: (16_384, 110_592),
         }
     }
@@ -108,7 +113,7 @@ impl Shape {
 
     /// The way of asking of `sdim-tiny`, with this shape's crops.
     pub fn settings(&self) -> Settings {
-        Settings { glimpse: self.glimpse, ..Settings::tiny() }
+        Settings { glimpse: self.glimpse, wide_glimpse: self.wide_glimpse, ..Settings::tiny() }
     }
 
     /// `config.json` for a vocabulary with so many number tokens.
@@ -179,7 +184,7 @@ mod tests {
 
     #[test]
     fn shapes_with_a_name_are_what_their_description_says() {
-        for (name, millions, resized) in [("tiny", 3.62, (384, 288)), ("small", 9.62, (384, 288))] {
+        for (name, millions, resized) in [("tiny", 3.97, (384, 288)), ("small", 9.99, (384, 288))] {
             let shape = Shape::named(name).unwrap();
             let files = FreshFiles::of(&shape, &shape.settings()).unwrap();
             let count: usize = files.initial(1).unwrap().values().map(|t| t.elem_count()).sum();

@@ -15,6 +15,7 @@
 //! | `measured_value` | f32 `[m]` | what the fusion block sees of it |
 //! | `told_count` | u16 `[n, v]` | measurements in the prompt |
 //! | `told_id`, `told_x`, `told_y` | u16 `[n, v, p]` | their token and pixel, in the order of the prompt; 0 after the last one |
+//! | `interpolated` | f32 `[n, v, h / 4, w / 4]` | what interpolation gives at the middle of each 4x4 pixels |
 //! | `asked_id`, `asked_x`, `asked_y` | u16 `[n, v, q]` | a question's token (its hint as a number) and pixel |
 //! | `asked_hint` | f32 `[n, v, q]` | the hint |
 //! | `asked_value` | f32 `[n, v, q]` | the true answer; NaN where it is not known |
@@ -26,6 +27,7 @@ use super::batch::{Asking, Example, Item};
 use super::tensor_file::{Reader, bytes, write};
 use crate::depth::SparseDepth;
 use crate::error::{Error, Result};
+use crate::model::CELL;
 use crate::query::prompt::{FrameSpace, MEASURED_TIME, QUERY_TIME, Tokens};
 use crate::query::{NumberTokens, Settings};
 use crate::vlm::qwen2_5::grid::Grid;
@@ -36,7 +38,7 @@ use safetensors::tensor::Dtype;
 use std::path::Path;
 
 /// The version of the format that this crate writes and reads.
-pub const VERSION: u32 = 2;
+pub const VERSION: u32 = 3;
 /// The metadata's key.
 const KEY: &str = "sdim_records";
 
@@ -89,6 +91,7 @@ pub struct Shard {
     pub told_id: Vec<u16>,
     pub told_x: Vec<u16>,
     pub told_y: Vec<u16>,
+    pub interpolated: Vec<f32>,
     pub asked_id: Vec<u16>,
     pub asked_x: Vec<u16>,
     pub asked_y: Vec<u16>,
@@ -114,6 +117,7 @@ impl Shard {
             told_id: u16s(),
             told_x: u16s(),
             told_y: u16s(),
+            interpolated: f32s(),
             asked_id: u16s(),
             asked_x: u16s(),
             asked_y: u16s(),
@@ -167,6 +171,7 @@ impl Shard {
             self.told_x.push(x.round() as u16);
             self.told_y.push(y.round() as u16);
         }
+        self.interpolated.extend(&example.interpolated);
         for item in &example.items {
             let ([id], [at], 1) = (&item.tokens.ids[..], &item.tokens.glimpses[..], item.supervised) else {
                 let found = format!("{} tokens, {} in the answer", item.tokens.len(), item.supervised);
@@ -189,9 +194,10 @@ impl Shard {
         let d = self.dims;
         let (variants, told) = (vec![d.frames, d.variants], vec![d.frames, d.variants, d.told]);
         let (asked, measured) = (vec![d.frames, d.variants, d.asked], vec![self.measured_pixel.len()]);
+        let cells = [d.frames, d.variants, d.height / CELL, d.width / CELL];
         let (f32s, u16s) = (|v: &[f32]| bytes(v, f32::to_le_bytes), |v: &[u16]| bytes(v, u16::to_le_bytes));
         let u32s = |v: &[u32]| bytes(v, u32::to_le_bytes);
-        let parts: [(&str, Dtype, &[usize], Vec<u8>); 16] = [
+        let parts: [(&str, Dtype, &[usize], Vec<u8>); 17] = [
             ("rgb", Dtype::U8, &[d.frames, d.height, d.width, 3], self.rgb.clone()),
             ("seed", Dtype::U64, &[d.frames], bytes(&self.seed, u64::to_le_bytes)),
             ("unit", Dtype::F32, &variants, f32s(&self.unit)),
@@ -203,6 +209,7 @@ impl Shard {
             ("told_id", Dtype::U16, &told, u16s(&self.told_id)),
             ("told_x", Dtype::U16, &told, u16s(&self.told_x)),
             ("told_y", Dtype::U16, &told, u16s(&self.told_y)),
+            ("interpolated", Dtype::F32, &cells, f32s(&self.interpolated)),
             ("asked_id", Dtype::U16, &asked, u16s(&self.asked_id)),
             ("asked_x", Dtype::U16, &asked, u16s(&self.asked_x)),
             ("asked_y", Dtype::U16, &asked, u16s(&self.asked_y)),
@@ -243,6 +250,7 @@ impl Shard {
             told_id: u16s("told_id", &nvp)?,
             told_x: u16s("told_x", &nvp)?,
             told_y: u16s("told_y", &nvp)?,
+            interpolated: f32s("interpolated", &[n, variants, height / CELL, width / CELL])?,
             asked_id: u16s("asked_id", &nvq)?,
             asked_x: u16s("asked_x", &nvq)?,
             asked_y: u16s("asked_y", &nvq)?,
@@ -308,13 +316,16 @@ impl Shard {
         let place = |x: &[u16], y: &[u16], i: usize| (usize::from(x[i]), usize::from(y[i]));
         for i in (0..usize::from(self.told_count[at])).map(|i| at * d.told + i) {
             let pixel = place(&self.told_x, &self.told_y, i);
-            prefix.push_at(&[self.token(self.told_id[i])], pixel, MEASURED_TIME, &space);
+            let id = self.token(self.told_id[i]);
+            prefix.push_at(&[id], asking.prompts.numbers(), pixel, MEASURED_TIME, &space);
         }
         let items = (at * d.asked..(at + 1) * d.asked).map(|i| self.item(asking, &space, at, i)).collect();
         let rgb = self.rgb[frame * area * 3..][..area * 3].to_vec();
         let resized = RgbImage::from_raw(d.width as u32, d.height as u32, rgb)
             .ok_or_else(|| Error::argument("frame", format!("{}x{}", d.width, d.height), "a picture"))?;
-        Ok(Example { pixels: Pixels { resized, grid }, scattered, unit, prefix, items })
+        let cells = (d.width / CELL) * (d.height / CELL);
+        let interpolated = self.interpolated[at * cells..][..cells].to_vec();
+        Ok(Example { pixels: Pixels { resized, grid }, scattered, interpolated, unit, prefix, items })
     }
 
     /// The id of a token that the records tell.
@@ -328,7 +339,8 @@ impl Shard {
     fn item(&self, asking: Asking, space: &FrameSpace, at: usize, i: usize) -> Item {
         let mut tokens = Tokens::default();
         let pixel = (usize::from(self.asked_x[i]), usize::from(self.asked_y[i]));
-        tokens.push_at(&[self.token(self.asked_id[i])], pixel, QUERY_TIME, space);
+        let id = self.token(self.asked_id[i]);
+        tokens.push_at(&[id], asking.prompts.numbers(), pixel, QUERY_TIME, space);
         let value = self.asked_value[i];
         let answer = asking.prompts.numbers().write(value);
         let (hint, scale) = (self.asked_hint[i], self.scale[at]);

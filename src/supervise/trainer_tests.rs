@@ -62,6 +62,7 @@ fn errors_are_counted_in_the_largest_measurement_or_in_medians() {
     let metres = Settings {
         unit: DepthUnit::Metres,
         number: NumberFormat::Bins { bins: 1000, range: 100.0 },
+        wide_glimpse: None,
         ..Settings::tiny()
     };
     let digits = Settings { number: NumberFormat::Digits { decimals: 2, integers: 3 }, ..metres.clone() };

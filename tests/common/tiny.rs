@@ -141,6 +141,7 @@ pub fn token(files: &FreshFiles, id: u32) -> String {
 pub fn wake(tensors: &mut Tensors) {
     for (name, scale) in [
         ("sdim.glimpse.weight", 0.02),
+        ("sdim.wide_glimpse.down.weight", 0.02),
         ("sdim.fusion.depth.conv.weight", 0.3),
         ("sdim.fusion.out.weight", 0.3),
     ] {

@@ -14,6 +14,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 BN_EPS, LEAKY_SLOPE, VISION_EPS = 1e-5, 0.01, 1e-6
+# Of wide crops (`src/model/wide_glimpse.rs`): the side of a cell, and by what differences of logarithms are multiplied and limited.
+CELL, STEEP = 4, 4.0
 # Time of measurements and of questions after the image's own (`src/query/prompt.rs`).
 TOLD_TIME, ASKED_TIME = 1.0, 2.0
 
@@ -23,6 +25,7 @@ class Batch(NamedTuple):
 
     rgb: Tensor  # u8 [b, h, w, 3]
     depth: Tensor  # f32 [b, h, w]: what the fusion block sees of measurements at their pixels, 0 elsewhere
+    interpolated: Tensor  # f32 [b, h / 4, w / 4]: what interpolation gives at the middle of each cell
     told_id: Tensor  # i64 [b, p]
     told_at: Tensor  # f32 [b, p, 2]: column and row
     told_count: Tensor  # i64 [b]
@@ -80,7 +83,7 @@ class Config(Bins):
                 raise ValueError(f"{directory}: {key} is not the way of asking that can be trained here")
         self.fusion = (fusion["branch"], fusion["high"], fusion["low"])
         super().__init__(number)
-        self.glimpse = self.sdim["glimpse"]
+        self.glimpse, self.wide_glimpse = self.sdim["glimpse"], self.sdim.get("wide_glimpse")
         self.scale = self.sdim["position_scale"]
         self.mean, self.std = image["image_mean"], image["image_std"]
         added = {t["content"]: t["id"] for t in read("tokenizer.json")["added_tokens"]}
@@ -289,6 +292,10 @@ class SdimModel(nn.Module):
         parts = {"fusion": Fusion(*config.fusion), "patch_embed": PatchEmbed(config.vision)}
         if config.glimpse:
             parts["glimpse"] = nn.Linear(3 * config.glimpse**2, c["hidden_size"], bias=False)
+        if config.wide_glimpse:
+            layers = {"up": nn.Linear(8 * config.glimpse**2, config.wide_glimpse)}
+            layers |= {"down": nn.Linear(config.wide_glimpse, c["hidden_size"], bias=False)}
+            parts["wide_glimpse"] = nn.ModuleDict(layers)
         self.sdim = nn.ModuleDict(parts)
         half = c["hidden_size"] // c["num_attention_heads"] // 2
         t, h, w = c["rope_scaling"]["mrope_section"]
@@ -318,7 +325,11 @@ class SdimModel(nn.Module):
         at = torch.cat([batch.told_at, batch.asked_at], 1)
         spoken = self.model.embed_tokens(torch.cat([batch.told_id, batch.asked_id], 1))
         if self.config.glimpse:
-            spoken = spoken + self.sdim["glimpse"](self.crops(image, at))
+            crops = self.crops(image, at)
+            spoken = spoken + self.sdim["glimpse"](crops)
+            if self.config.wide_glimpse:
+                wide = self.sdim["wide_glimpse"]
+                spoken = spoken + wide["down"](F.relu(wide["up"](torch.cat([crops, self.wide_crops(image, batch)], -1))))
         words = self.model.embed_tokens(self.words).expand(b, -1, -1).to(tokens.dtype)
         x = torch.cat([words[:, :1], tokens.flatten(1, 2), words[:, 1:], spoken.to(tokens.dtype)], 1)
         cos, sin = self.positions(image, rows, cols, at, batch.told_id.shape[1])
@@ -356,8 +367,20 @@ class SdimModel(nn.Module):
         angles = torch.cat([opening, pixels], 1)[..., self.axis] * self.inverse
         return angles.cos(), angles.sin()
 
+    def wide_crops(self, image, batch):
+        """Cells around pixels: mean colour, interpolated depth relative to what the token states, measured: [b, n, 5 side side]."""
+        depth = batch.interpolated.log()[:, None]
+        measured = F.max_pool2d((batch.depth != 0).float()[:, None], CELL)
+        cells = torch.cat([F.avg_pool2d(image, CELL), depth, measured], 1)
+        at = (torch.cat([batch.told_at, batch.asked_at], 1) + 0.5) / CELL - 0.5
+        stated = torch.cat([batch.told_id, batch.asked_id], 1) - self.config.first_number + 0.5
+        stated = self.config.number(stated.clamp(min=0.5)).log()
+        crops = self.crops(cells, at).unflatten(2, (5, -1))
+        depth = ((crops[:, :, 3:4] - stated[..., None, None]) * STEEP).clamp(-STEEP, STEEP)
+        return torch.cat([crops[:, :, :3], depth, crops[:, :, 4:]], 2).flatten(2)
+
     def crops(self, image, at):
-        """The normalised picture around pixels, bilinear, its border repeated: [b, n, 3 side side]."""
+        """The normalised picture around pixels, bilinear, its border repeated: [b, n, channels side side]."""
         side, (b, n, _) = self.config.glimpse, at.shape
         height, width = image.shape[2:]
         offset = torch.arange(side, device=at.device) - (side - 1) / 2

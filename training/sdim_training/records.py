@@ -12,7 +12,7 @@ from safetensors import safe_open
 
 from .model import Batch
 
-VERSION = 2
+VERSION = 3
 
 
 class Shard:
@@ -58,7 +58,9 @@ def assemble(samples, pin=False):
         row[part["measured_pixel"]] = part["measured_value"]
     depth = depth.reshape(-1, shard.height, shard.width)
     depth[mirrored] = depth[mirrored][..., ::-1]
-    batch = dict(depth=depth, told_at=at("told"), asked_at=at("asked"), hint=stack["asked_hint"])
+    cells = stack["interpolated"].copy()
+    cells[mirrored] = cells[mirrored][..., ::-1]
+    batch = dict(depth=depth, interpolated=cells, told_at=at("told"), asked_at=at("asked"), hint=stack["asked_hint"])
     batch |= {k: stack[k].astype(np.int64) for k in ("told_id", "told_count", "asked_id")}
     batch |= dict(value=stack["asked_value"], scale=stack["scale"])
     batch = {k: torch.from_numpy(v) for k, v in batch.items()}

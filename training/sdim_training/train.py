@@ -21,7 +21,7 @@ from .model import Config, SdimModel
 from .records import Pool, held_out
 
 # What a resumed run must share with its beginning, since the schedule or the order of the data depends on it.
-KEPT = ("seed", "batch", "rate", "warmup", "steps", "weight_decay", "l1", "average", "freeze_norm_at")
+KEPT = ("seed", "batch", "rate", "warmup", "steps", "weight_decay", "l1", "average", "freeze_norm_at", "sharp")
 COUNTED = ("step", "skipped", "spent", "best")
 BN_MOMENTUM = 0.05
 # So many steps one after the other that are not finite are no accident.
@@ -47,6 +47,7 @@ def options(arguments=None):
     add("--clip", type=float, default=1.0, help="largest norm of the gradients")
     add("--average", type=float, default=0.998, help="decay of the moving average per step")
     add("--freeze-norm-at", type=float, default=0.5, help="share of the schedule after which statistics are kept")
+    add("--sharp", action="store_true", help="narrow targets from the first step: for a run that goes on from trained weights")
     add("--seed", type=int, default=7)
     add("--follow", action="store_true", help="the folder of records still grows (the order of the data depends on it)")
     add("--wait-frames", type=int, default=0, help="frames that must be there before training starts")
@@ -108,7 +109,8 @@ class Trainer:
         """Loss, L1 and the statistics that the normalisations saw."""
         with self.precision():
             logits, seen = self.net(batch, progress < self.chosen.freeze_norm_at)
-        return *bin_loss(logits, batch, self.config, *blur(progress), self.chosen.l1), seen
+        blurred = blur(1.0 if self.chosen.sharp else progress)
+        return *bin_loss(logits, batch, self.config, *blurred, self.chosen.l1), seen
 
     def train_step(self, batch, progress):
         """One step; returns loss, L1 and the gradients' norm. A step whose gradients are not finite changes nothing."""

@@ -36,9 +36,7 @@ impl<'a> Picture<'a> {
     pub fn crops(&self, config: &PreprocessorConfig, places: &[(f32, f32)], side: usize) -> Result<Tensor> {
         let size = (self.image.width() as usize, self.image.height() as usize);
         if let Some(samples) = &self.samples {
-            let at_a_time = (SAMPLES_AT_A_TIME / samples_of(side)).max(1);
-            let parts = places.chunks(at_a_time).map(|some| cut(samples, size, config, some, side));
-            return joined(parts.collect::<Result<Vec<_>>>()?);
+            return in_parts(places, side, 3, |some| cut(samples, size, config, some, side));
         }
         let len = 3 * side * side;
         let mut crops = vec![0f32; places.len() * len];
@@ -49,15 +47,26 @@ impl<'a> Picture<'a> {
     }
 }
 
-/// Bytes that cutting a crop off the CPU takes, about.
-pub fn bytes_per_crop(side: usize) -> usize {
+/// Bytes that cutting crops of so many channels off the CPU takes for each place, about.
+pub fn bytes_per_crop(side: usize, channels: usize) -> usize {
     // The samples, differences and sums of one axis, and what is made of them.
-    5 * samples_of(side) * size_of::<f32>()
+    5 * samples_of(side, channels) * size_of::<f32>()
 }
 
 /// Samples that a crop reads: bilinear values need one more on each axis.
-fn samples_of(side: usize) -> usize {
-    3 * (side + 1) * (side + 1)
+fn samples_of(side: usize, channels: usize) -> usize {
+    channels * (side + 1) * (side + 1)
+}
+
+/// Crops of all places, of so many at a time that a device holds their samples.
+pub(crate) fn in_parts<P>(
+    places: &[P],
+    side: usize,
+    channels: usize,
+    cut: impl Fn(&[P]) -> Result<Tensor>,
+) -> Result<Tensor> {
+    let at_a_time = (SAMPLES_AT_A_TIME / samples_of(side, channels)).max(1);
+    joined(places.chunks(at_a_time).map(cut).collect::<Result<Vec<_>>>()?)
 }
 
 /// These rows one after the other.
@@ -79,7 +88,22 @@ fn cut(
     places: &[(f32, f32)],
     side: usize,
 ) -> Result<Tensor> {
-    let (n, device) = (places.len(), samples.device());
+    let values = sampled(samples, (width, height), places, side)?;
+    let (scale, shift) = config.scale_and_shift();
+    let scaled = values.broadcast_mul(&Tensor::new(&scale, samples.device())?)?;
+    let crops = scaled.broadcast_sub(&Tensor::new(&shift, samples.device())?)?;
+    Ok(crops.permute((0, 3, 1, 2))?.reshape((places.len(), 3 * side * side))?)
+}
+
+/// Bilinear values of `[height * width, channels]` in windows of `side` x `side` around places, the border repeated:
+/// `[places, side, side, channels]`.
+pub(crate) fn sampled(
+    samples: &Tensor,
+    (width, height): (usize, usize),
+    places: &[(f32, f32)],
+    side: usize,
+) -> Result<Tensor> {
+    let (n, device, channels) = (places.len(), samples.device(), samples.dim(1)?);
     let numbers: Vec<f32> = places.iter().flat_map(|&(x, y)| [x, y]).collect();
     let first = (Tensor::from_vec(numbers, (n, 2), device)? - (side as f64 - 1.0) / 2.0)?;
     let whole = first.floor()?;
@@ -91,17 +115,13 @@ fn cut(
     };
     let rows = (along(1, height)? * width as f64)?.reshape((n, side + 1, 1))?;
     let index = rows.broadcast_add(&along(0, width)?.reshape((n, 1, side + 1))?)?;
-    let read = samples.index_select(&index.flatten_all()?, 0)?.reshape((n, side + 1, side + 1, 3))?;
+    let read = samples.index_select(&index.flatten_all()?, 0)?.reshape((n, side + 1, side + 1, channels))?;
     let between = |t: &Tensor, dim: usize, axis: usize| -> Result<Tensor> {
         let (before, after) = (t.narrow(dim, 0, side)?, t.narrow(dim, 1, side)?);
         let part = part.narrow(1, axis, 1)?.reshape((n, 1, 1, 1))?;
         Ok((&before + (after - &before)?.broadcast_mul(&part)?)?)
     };
-    let values = between(&between(&read, 2, 0)?, 1, 1)?;
-    let (scale, shift) = config.scale_and_shift();
-    let scaled = values.broadcast_mul(&Tensor::new(&scale, device)?)?;
-    let crops = scaled.broadcast_sub(&Tensor::new(&shift, device)?)?;
-    Ok(crops.permute((0, 3, 1, 2))?.reshape((n, 3 * side * side))?)
+    between(&between(&read, 2, 0)?, 1, 1)
 }
 
 #[cfg(test)]

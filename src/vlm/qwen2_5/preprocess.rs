@@ -187,7 +187,7 @@ impl PreprocessorConfig {
     }
 
     /// What a value of 0 to 255 between samples is multiplied by, and what is taken from that then, to normalise it; of each channel.
-    pub(super) fn scale_and_shift(&self) -> ([f32; 3], [f32; 3]) {
+    pub(crate) fn scale_and_shift(&self) -> ([f32; 3], [f32; 3]) {
         let scale = self.image_std.map(|deviation| 1.0 / (255.0 * deviation));
         (scale, std::array::from_fn(|c| self.image_mean[c] / self.image_std[c]))
     }
