@@ -24,6 +24,7 @@ impl Checkpoint {
     fn new() -> Self {
         let mut settings = Settings::tiny();
         settings.number = sdim::settings::NumberFormat::Bins { bins: 40, range: 1.25 };
+        settings.wide_glimpse = None;
         let files = tiny::small_files(&settings);
         let tensors = tiny::tensors(&files, 3);
         let dir = tempfile::tempdir().unwrap();

@@ -198,6 +198,7 @@ fn pointer_in_words() -> Settings {
     settings.template.query = "at {pixel}?".into();
     settings.template.answer = "is {y}".into();
     settings.number = NumberFormat::Bins { bins: 100, range: 1.25 };
+    settings.wide_glimpse = None;
     settings
 }
 
@@ -211,6 +212,7 @@ fn pointer_and_digits() -> Settings {
     let mut settings = Settings::tiny();
     settings.rope_layout = RopeLayout::Contiguous;
     settings.number = NumberFormat::Digits { decimals: 2, integers: 2 };
+    settings.wide_glimpse = None;
     settings.unit = DepthUnit::Metres;
     settings.hint = Hint::Linear;
     settings.measurements = MeasurementPrompt::Prefix { max: 16 };

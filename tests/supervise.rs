@@ -104,12 +104,13 @@ fn the_papers_words_and_digits_are_trained_on_sparse_labels() {
         // The paper: sentences, coordinates, mask per query.
         Settings { number: digits, fusion: Settings::tiny().fusion, ..Settings::paper() },
         // Digits at a pointer, measurements in the prefix.
-        Settings { number: digits, pixel_reference: pointer, ..Settings::tiny() },
+        Settings { number: digits, pixel_reference: pointer, wide_glimpse: None, ..Settings::tiny() },
         // One number token as the answer to the paper's sentences.
         Settings {
             template: PromptTemplate::paper(),
             measurements: MeasurementPrompt::None,
             pixel_reference: PixelReference::Coordinates,
+            wide_glimpse: None,
             ..Settings::tiny()
         },
     ];

@@ -4,6 +4,7 @@ use crate::error::{Error, Result};
 use crate::query::prompt::Glimpse;
 use crate::vlm::checkpoint::weights::Weights;
 use crate::vlm::layers::linear::Linear;
+use crate::vlm::qwen2_5::bilinear::bilinear;
 use crate::vlm::qwen2_5::config::VlmConfig;
 use crate::vlm::qwen2_5::crops::{in_parts, sampled};
 use crate::vlm::qwen2_5::preprocess::PreprocessorConfig;
@@ -127,30 +128,15 @@ impl WideView {
     }
 
     fn crop(&self, at: &Glimpse, side: usize, out: &mut [f32]) {
-        let (columns, rows) = (self.size.0 as i64, self.size.1 as i64);
-        let (x, y) = in_cells(at);
-        let first = |p: f32| p - (side as f32 - 1.0) / 2.0;
-        let (x0, y0) = (first(x), first(y));
-        let (fx, fy) = (x0 - x0.floor(), y0 - y0.floor());
-        let (x0, y0) = (x0.floor() as i64, y0.floor() as i64);
         let stated = at.stated.ln();
-        for dy in 0..side {
-            let row = |y: i64| y.clamp(0, rows - 1) * columns;
-            let (top, bottom) = (row(y0 + dy as i64), row(y0 + dy as i64 + 1));
-            for dx in 0..side {
-                let left = (x0 + dx as i64).clamp(0, columns - 1);
-                let right = (x0 + dx as i64 + 1).clamp(0, columns - 1);
-                let corners = [top + left, top + right, bottom + left, bottom + right];
-                let [a, b, d, e] =
-                    corners.map(|i| &self.cells[i as usize * WIDE_CHANNELS..][..WIDE_CHANNELS]);
-                for c in 0..WIDE_CHANNELS {
-                    let (u, v) = (a[c] + (b[c] - a[c]) * fx, d[c] + (e[c] - d[c]) * fx);
-                    let value = u + (v - u) * fy;
-                    out[(c * side + dy) * side + dx] =
-                        if c == DEPTH { relative(value, stated) } else { value };
+        bilinear::<WIDE_CHANNELS, f32>(&self.cells, self.size, in_cells(at), side, |dy, row| {
+            for c in 0..WIDE_CHANNELS {
+                let line = &mut out[(c * side + dy) * side..][..side];
+                for (value, &read) in line.iter_mut().zip(row[c..].iter().step_by(WIDE_CHANNELS)) {
+                    *value = if c == DEPTH { relative(read, stated) } else { read };
                 }
             }
-        }
+        });
     }
 
     /// [`WideView::crop`] as operations on tensors, each in its order, so that the values are the same bits.

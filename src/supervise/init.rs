@@ -207,4 +207,32 @@ mod tests {
         assert_eq!(values(own), values(&named[table].narrow(0, first, 1000).unwrap()));
         assert!(rows[table].dims()[0] < 300, "words alone: {:?}", rows[table].dims());
     }
+
+    #[test]
+    fn a_grown_model_keeps_what_it_had_and_starts_with_a_part_that_adds_nothing() {
+        let dir = tempfile::tempdir().unwrap();
+        let [old, grown] = ["old", "grown"].map(|name| dir.path().join(name));
+        let before = Settings { wide_glimpse: None, ..Settings::tiny() };
+        FreshFiles::tiny(&before).unwrap().write_initial(&old, 1).unwrap();
+        let files = FreshFiles::tiny(&Settings::tiny()).unwrap();
+        files.write_grown(&grown, 2, &old).unwrap();
+        let read = |dir: &Path| candle_core::safetensors::load(dir.join(WEIGHTS), &Device::Cpu).unwrap();
+        let (known, found) = (read(&old), read(&grown));
+        let values = |t: &Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+        for (name, tensor) in &found {
+            match known.get(name) {
+                Some(known) => assert_eq!(values(tensor), values(known), "{name}"),
+                None => assert!(name.starts_with("sdim.wide_glimpse."), "{name}"),
+            }
+        }
+        assert_eq!(found.len(), known.len() + 3);
+        assert!(values(&found["sdim.wide_glimpse.down.weight"]).iter().all(|v| *v == 0.0));
+        assert_eq!(FreshFiles::load(&grown).unwrap(), files);
+        assert!(matches!(files.write_grown(&grown, 2, &dir.path().join("none")), Err(Error::Io { .. })));
+        std::fs::write(old.join(WEIGHTS), "no tensors").unwrap();
+        assert!(matches!(files.write_grown(&grown, 2, &old), Err(Error::Format { .. })));
+        let other = [("lm_head.bias".to_string(), known["model.norm.weight"].clone())];
+        write_tensors(&old.join(WEIGHTS), other.iter().map(|(n, t)| (n, t))).unwrap();
+        assert!(matches!(files.write_grown(&grown, 2, &old), Err(Error::Argument { .. })));
+    }
 }

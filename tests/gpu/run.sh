@@ -125,7 +125,7 @@ tests golden 45 golden --skip formats --test-threads 4
 tests device 45 device --test-threads 2
 # Those unit tests of the kernels that choose their device, `on_device` in src/kernels/testing.rs, with the ones beside them.
 tests kernels 25 lib kernels::cuda kernels::fused_tests kernels::attention::batched kernels::ops::norm kernels::ops::rope kernels::ops::bin_rows \
-    vlm::qwen2_5::crops
+    vlm::qwen2_5::crops model::wide_glimpse
 # What lies between the products of a layer of the 3B shapes, with and without our kernels.
 operations 30
 model 3b-bf16 60 --random 3b --weights bf16 --queries 4096 --batch 2048 --rounds 3

@@ -33,6 +33,7 @@ fn files() -> Files {
     let dir = tempfile::tempdir().unwrap();
     let mut settings = Settings::tiny();
     settings.number = sdim::settings::NumberFormat::Bins { bins: 40, range: 1.25 };
+    settings.wide_glimpse = None;
     let files = common::tiny::small_files(&settings);
     common::tiny::write(dir.path(), &files, &common::tiny::tensors(&files, 3));
     let names =

@@ -37,6 +37,7 @@ pub fn pointer(tokens: NumberTokens) -> Settings {
         rope_layout: RopeLayout::Contiguous,
         position_scale: 1.0,
         glimpse: None,
+        wide_glimpse: None,
         fusion: None,
         measurements: MeasurementPrompt::Prefix { max: 20 },
         number: NumberFormat::LogBins { bins: BINS, lowest: 0.1, highest: 10.0 },

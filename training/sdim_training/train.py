@@ -22,10 +22,13 @@ from .records import Pool, held_out
 
 # What a resumed run must share with its beginning, since the schedule or the order of the data depends on it.
 KEPT = ("seed", "batch", "rate", "warmup", "steps", "weight_decay", "l1", "average", "freeze_norm_at", "sharp")
-COUNTED = ("step", "skipped", "spent", "best")
+COUNTED = ("step", "skipped", "spent", "best", "trouble", "slow", "returns")
 BN_MOMENTUM = 0.05
 # So many steps one after the other that are not finite are no accident.
 MOST_SKIPPED = 100
+# Weights on their way to where nothing is finite skip more and more steps. When so much of the last steps (weighed by powers of 0.95) was
+# skipped, the run goes back to its moving average, which lies before, at half the rate.
+TROUBLE = 0.3
 
 
 def options(arguments=None):
@@ -87,6 +90,7 @@ class Trainer:
         gpu = device.type == "cuda"
         self.optimiser = torch.optim.AdamW(groups, lr=chosen.rate, betas=(0.9, 0.98), eps=1e-8, fused=gpu)
         self.step, self.skipped, self.in_a_row, self.spent, self.best = 0, 0, 0, 0.0, math.inf
+        self.trouble, self.slow, self.returns = 0.0, 1.0, 0
         if chosen.resume:
             self.load()
         self.bf16 = gpu if chosen.precision is None else chosen.precision == "bf16"
@@ -131,14 +135,23 @@ class Trainer:
         else:
             self.skipped, self.in_a_row = self.skipped + 1, self.in_a_row + 1
         self.optimiser.zero_grad(set_to_none=True)
+        self.trouble = 0.95 * self.trouble + (0.05 if self.in_a_row else 0.0)
+        if self.trouble > TROUBLE:
+            self.go_back()
         if self.in_a_row >= MOST_SKIPPED:
             raise SystemExit(f"{MOST_SKIPPED} steps without finite gradients up to step {self.step}: a lower --rate")
         return loss, l1, norm
 
+    def go_back(self):
+        """To the moving average, without moments, at half the rate."""
+        self.model.load_state_dict(self.average.state_dict())
+        self.optimiser.state.clear()
+        self.trouble, self.slow, self.returns = 0.0, self.slow / 2, self.returns + 1
+
     def rate(self, progress):
-        """Linear warm-up by steps, times a cosine down to a hundredth."""
+        """Linear warm-up by steps, times a cosine down to a hundredth; halved by each return to the average."""
         warm = min(1.0, (self.step + 1) / max(1, self.chosen.warmup))
-        return self.chosen.rate * warm * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(1.0, progress))))
+        return self.slow * self.chosen.rate * warm * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(1.0, progress))))
 
     @torch.no_grad()
     def measure(self, seen):
@@ -264,6 +277,8 @@ class Reporter:
         said = ", ".join(f"{k} {v:.4g}" for k, v in values.items() if not k.startswith(("sdim", "linear")))
         self.say(f"step {t.step}: {said}")
         shortages = dict(checkpoint.shortages(self.chosen.out, t.model, t.device))
+        again = f"steps were not finite: return {t.returns} to the average, at {t.slow} of the rate"
+        shortages |= {f"return {t.returns}": again} if t.returns else {}
         shortages |= {"records": "no room for more records (--memory-gb)"} if self.pool.full else {}
         for what in shortages.keys() - self.said:
             self.said.add(what)
@@ -290,7 +305,7 @@ class Reporter:
 
     def finish(self, progress):
         t, gpu = self.trainer, self.trainer.device.type == "cuda"
-        result = dict(steps=t.step, seen=t.step * self.chosen.batch * t.world, skipped=t.skipped)
+        result = dict(steps=t.step, seen=t.step * self.chosen.batch * t.world, skipped=t.skipped, returns=t.returns)
         result |= dict(held_out=self.evaluate(progress), seconds=round(self.schedule.seconds(), 1))
         result |= dict(records=self.pool.frames(), parameters=self.parameters, processes=t.world)
         result |= dict(device=torch.cuda.get_device_name() if gpu else "cpu")

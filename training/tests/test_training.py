@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 import shutil
 from types import SimpleNamespace
 
@@ -75,6 +76,32 @@ def test_steps_that_are_not_finite_change_nothing(tmp_path):
         assert all(torch.equal(v, old[k]) for k, v in model.state_dict().items())
     trainer.train_step(batch, 0.0)
     assert trainer.in_a_row == 0 and not torch.equal(trainer.model.model.norm.weight, before[0]["model.norm.weight"])
+
+
+def test_a_run_that_leaves_what_is_finite_goes_back_to_its_average_more_slowly(tmp_path):
+    trainer, _, batch = trainer_and_batch(tmp_path)
+    for _ in range(12):
+        trainer.train_step(batch, 0.0)
+    rate = trainer.rate(0.3)
+    with torch.no_grad():
+        trainer.model.model.norm.weight.fill_(float("inf"))
+    lost = 0
+    while not trainer.returns:
+        trainer.train_step(batch, 0.0)
+        lost += 1
+    assert lost == 7 and trainer.skipped == 7, "as many as make 0.3 of the last ones"
+    average = trainer.average.state_dict()
+    assert all(torch.equal(v, average[k]) for k, v in trainer.model.state_dict().items())
+    _, _, norm = trainer.train_step(batch, 0.0)
+    assert math.isfinite(norm) and trainer.in_a_row == 0 and trainer.slow == 0.5
+    # The warm-up went on meanwhile: the same place of the schedule, half the rate.
+    trainer.step = 11
+    assert trainer.rate(0.3) == pytest.approx(rate / 2)
+    # Single steps that are lost are no reason.
+    for i in range(40):
+        value = batch.value * float("nan") if i % 5 == 0 else batch.value
+        trainer.train_step(batch._replace(value=value), 0.0)
+    assert trainer.returns == 1 and trainer.skipped == 15
 
 
 def test_statistics_are_measured_up_to_half_and_averaged_like_weights(tmp_path):

@@ -3,6 +3,7 @@
 //! Tokens are rows of `[tokens, width]` tensors; there is no batch axis and no padding. Structs and names are those of the
 //! published checkpoints.
 
+pub(crate) mod bilinear;
 pub mod cache;
 pub mod config;
 pub mod crops;

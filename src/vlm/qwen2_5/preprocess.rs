@@ -1,5 +1,6 @@
 //! From an RGB frame to the rows of the patch embedding, as the published image processor does it.
 
+use super::bilinear::bilinear;
 use super::grid::Grid;
 use crate::error::{Error, Result};
 use crate::image::resize;
@@ -195,27 +196,16 @@ impl PreprocessorConfig {
     /// A normalised crop of `side` x `side` pixels around a place between pixels, bilinear, the border repeated; written as
     /// channel, y, x into `out`, which holds 3 x `side` x `side` values.
     pub fn crop(&self, image: &RgbImage, x: f32, y: f32, side: usize, out: &mut [f32]) {
-        let (w, h) = (image.width() as i64, image.height() as i64);
-        let raw = image.as_raw();
-        let first = |p: f32| p - (side as f32 - 1.0) / 2.0;
-        let (x0, y0) = (first(x), first(y));
-        let (fx, fy) = (x0 - x0.floor(), y0 - y0.floor());
-        let (x0, y0) = (x0.floor() as i64, y0.floor() as i64);
+        let size = (image.width() as usize, image.height() as usize);
         let (scale, shift) = self.scale_and_shift();
-        for dy in 0..side {
-            let row = |y: i64| y.clamp(0, h - 1) * w;
-            let (top, bottom) = (row(y0 + dy as i64), row(y0 + dy as i64 + 1));
-            for dx in 0..side {
-                let left = (x0 + dx as i64).clamp(0, w - 1);
-                let right = (x0 + dx as i64 + 1).clamp(0, w - 1);
-                let corners = [top + left, top + right, bottom + left, bottom + right];
-                for (c, (s, m)) in scale.iter().zip(&shift).enumerate() {
-                    let [a, b, d, e] = corners.map(|i| f32::from(raw[i as usize * 3 + c]));
-                    let (u, v) = (a + (b - a) * fx, d + (e - d) * fx);
-                    out[(c * side + dy) * side + dx] = (u + (v - u) * fy) * s - m;
+        bilinear::<3, u8>(image.as_raw(), size, (x, y), side, |dy, row| {
+            for c in 0..3 {
+                let line = &mut out[(c * side + dy) * side..][..side];
+                for (value, &read) in line.iter_mut().zip(row[c..].iter().step_by(3)) {
+                    *value = read * scale[c] - shift[c];
                 }
             }
-        }
+        });
     }
 
     /// The normalised frame `[height, width, 3]`, f32: what the fusion block convolves.
