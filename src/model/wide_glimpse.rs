@@ -258,8 +258,8 @@ mod tests {
             let sum: f32 = pixels.map(|(x, y)| config().normalise(frame().get_pixel(x, y).0[c], c)).sum();
             sum / 16.0
         };
-        for c in 0..3 {
-            assert!((crop[c] - mean(c)).abs() < 1e-4, "{c}: {} for {}", crop[c], mean(c));
+        for (c, value) in crop[..3].iter().enumerate() {
+            assert!((value - mean(c)).abs() < 1e-4, "{c}: {value} for {}", mean(c));
         }
         let ratio = depths()[2 * 12 + 4] / 3.0;
         assert!((crop[DEPTH] - 4.0 * ratio.ln()).abs() < 1e-4, "{}", crop[DEPTH]);
