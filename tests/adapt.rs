@@ -113,7 +113,7 @@ fn what_is_better_is_written_and_loads() {
             std::fs::copy(frame(3), frame(other)).unwrap();
         }
     }
-    let files = common::tiny::small_files(&Settings::tiny());
+    let files = common::tiny::small_files(&Settings { wide_glimpse: None, ..Settings::tiny() });
     std::fs::create_dir(&base).unwrap();
     common::tiny::write(&base, &files, &common::tiny::tensors(&files, 3));
     let flags =
@@ -123,7 +123,7 @@ fn what_is_better_is_written_and_loads() {
     assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
     let told: serde_json::Value = serde_json::from_str(&said).unwrap();
     assert_eq!(told["written"], text(&out), "{said}");
-    assert!(told["ratio"].as_f64().unwrap() < 0.75 && told["steps"] == 45, "{said}");
+    assert!(told["ratio"].as_f64().unwrap() < 0.6 && told["steps"] == 45, "{said}");
     let frames = OwnFrames::read(&data, None).unwrap().frames;
     let load = |options: LoadOptions| DepthCompleter::load(&base, &options).unwrap();
     let [before, after] = [load(f32_options()), load(f32_options().with_adapter(&out))];

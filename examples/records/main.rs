@@ -50,7 +50,7 @@ struct Args {
     /// Write a checkpoint with initial weights here.
     #[arg(long, required_unless_present_any = ["out", "list"])]
     fresh: Option<PathBuf>,
-    /// Checkpoint directory that the initial weights are taken from, those that it has in the same shape.
+    /// Checkpoint directory that the initial weights are taken from; what the shape has and it has not is initial.
     #[arg(long, requires = "fresh")]
     from: Option<PathBuf>,
     /// Folder of the records.
@@ -171,11 +171,10 @@ fn fresh(args: &Args) -> anyhow::Result<FreshFiles> {
     let files = FreshFiles::of(&shape, &settings)?;
     match (&args.fresh, &args.from) {
         (Some(dir), Some(from)) => {
-            files.write_grown(dir, args.seed, from)?;
+            let fresh = files.write_grown(dir, args.seed, from)?;
+            let (dir, from) = (dir.display(), from.display());
             eprintln!(
-                "{}: weights of {}, the rest initial ones of seed {}",
-                dir.display(),
-                from.display(),
+                "{dir}: weights of {from}; {fresh} tensors that it has not are initial ones of seed {}",
                 args.seed
             );
         }

@@ -3,8 +3,8 @@
 use super::clock::Watch;
 use super::options::{CompleteOptions, Outliers};
 use super::stages::StageSeconds;
+use crate::depth::SparseDepth;
 use crate::depth::outliers::{Contradiction, contradictions, without};
-use crate::depth::{SparseDepth, interpolate};
 use crate::error::Result;
 use crate::model::{AskOptions, Prefix, SdimModel, ask};
 use crate::query::{Hint, Query, Reading};
@@ -97,8 +97,8 @@ impl Reader<'_> {
         }
         let settings = self.model.prompts.settings();
         let hints = match settings.hint {
-            Hint::Linear => interpolate::linear(rest)?,
-            Hint::None => Vec::new(),
+            Hint::Linear => prefix.hints(rest)?,
+            Hint::None => Cow::Borrowed([].as_slice()),
         };
         let query = |c: &Contradiction| {
             let hint = hints.get(c.pixel).copied().unwrap_or(f32::NAN);

@@ -66,10 +66,9 @@ impl<'a> Questions<'a> {
         watch: &'a Watch,
     ) -> Result<Self> {
         let (prefix, sparse, flagged) = (&believed.prefix, &*believed.sparse, &*believed.flagged);
-        let hint = match (model.prompts.settings().hint, &prefix.interpolated) {
-            (Hint::Linear, Some(known)) => Cow::Borrowed(known.as_slice()),
-            (Hint::Linear, None) => Cow::Owned(interpolate::linear(sparse)?),
-            (Hint::None, _) => Cow::Borrowed([].as_slice()),
+        let hint = match model.prompts.settings().hint {
+            Hint::Linear => prefix.hints(sparse)?,
+            Hint::None => Cow::Borrowed([].as_slice()),
         };
         Ok(Self { model, prefix, rgb, sparse, flagged, options, hint, watch })
     }

@@ -29,9 +29,23 @@ pub struct Prefix {
     /// What tokens at pixels see of the frame.
     pub view: View<'static>,
     /// Linear interpolation of the measurements at each pixel of the frame, metres, where the checkpoint's wide crops need it.
-    pub interpolated: Option<Vec<f32>>,
+    interpolated: Option<Vec<f32>>,
     /// The frame that each query marks for itself, for [`PixelReference::Marker`].
     pub marked: Option<MarkedFrame>,
+}
+
+impl Prefix {
+    /// Linear interpolation of the frame's measurements, metres at each pixel: what was kept of it, or made anew. `sparse` is what the prefix was read
+    /// with.
+    ///
+    /// # Errors
+    /// [`crate::Error::NoMeasurement`] for a map without measurements.
+    pub fn hints(&self, sparse: &SparseDepth) -> Result<Cow<'_, [f32]>> {
+        Ok(match &self.interpolated {
+            Some(known) => Cow::Borrowed(known.as_slice()),
+            None => Cow::Owned(interpolate::linear(sparse)?),
+        })
+    }
 }
 
 /// A frame as its queries need it.

@@ -81,8 +81,8 @@ pub struct Settings {
     #[serde(default)]
     pub glimpse: Option<usize>,
     /// Width of the hidden layer through which each token at a pixel also sees a crop as many cells wide of the frame at a quarter of its
-    /// size, with the interpolated depth relative to the number that the token states, and where measurements are; `null` for none. It
-    /// needs a crop (`glimpse`), a hint, and numbers that are bins of equal ratio.
+    /// size, with the logarithm of the interpolated depth by the number that the token states, and where measurements are; `null` for none.
+    /// It needs a crop (`glimpse`), a pointer that states its hint, and numbers that are bins of equal ratio.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub wide_glimpse: Option<usize>,
     /// How numbers are written.

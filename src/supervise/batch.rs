@@ -5,7 +5,7 @@ use super::measure::{measure, spoil};
 use super::mix::Scenes;
 use super::recipe::{BatchConfig, LabelSource};
 use crate::depth::SparseDepth;
-use crate::depth::interpolate::{self, Interpolator};
+use crate::depth::interpolate::Interpolator;
 use crate::error::{Error, Result};
 use crate::model::{SdimModel, View, at_cells, scatter};
 use crate::query::prompt::Tokens;
@@ -296,8 +296,7 @@ pub(super) fn written_on(
     }
     items.sort_by_key(|i| i.tokens.len());
     let scattered = scatter(prompted, resized.0, resized.1, |depth| writer.seen(depth, space.unit));
-    let dense = interpolate::linear(prompted)?;
-    let interpolated = at_cells(&dense, (width, height), resized, space.unit);
+    let interpolated = at_cells(&interpolator.raster(&values), (width, height), resized, space.unit);
     Ok(Example { pixels, scattered, interpolated, unit: space.unit, prefix, items })
 }
 

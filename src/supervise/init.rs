@@ -1,6 +1,7 @@
 //! A fresh small checkpoint: its files and its initial weights.
 
 use super::shape::Shape;
+use super::store::MODEL;
 use super::vocabulary::byte_tokenizer;
 use crate::error::{Error, Result};
 use crate::files::{read_text, write_tensors, write_whole};
@@ -13,9 +14,6 @@ use candle_core::{Device, Tensor};
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::path::Path;
-
-/// Where the weights of a small checkpoint are.
-const WEIGHTS: &str = "model.safetensors";
 
 /// The JSON files of a checkpoint, as text.
 #[derive(Debug, Clone, PartialEq)]
@@ -102,36 +100,47 @@ impl FreshFiles {
     /// As [`FreshFiles::initial`]; [`Error::Io`].
     pub fn write_initial(&self, dir: &Path, seed: u64) -> Result<()> {
         self.write(dir)?;
-        write_tensors(&dir.join(WEIGHTS), &self.initial(seed)?)
+        write_tensors(&dir.join(MODEL), &self.initial(seed)?)
     }
 
-    /// As [`FreshFiles::write_initial`], with all tensors that a checkpoint directory has in the same shape from there: where the
-    /// training of a model goes on that has grown a part.
+    /// As [`FreshFiles::write_initial`], with the tensors of a checkpoint directory: where the training of a model goes on that has grown a
+    /// part. Returns how many tensors the directory did not have.
     ///
     /// # Errors
-    /// As [`FreshFiles::write_initial`]; [`Error::Format`] if its weights cannot be read; [`Error::Argument`] if it has none of the tensors.
-    pub fn write_grown(&self, dir: &Path, seed: u64, from: &Path) -> Result<()> {
-        let path = from.join(WEIGHTS);
+    /// As [`FreshFiles::write_initial`]; [`Error::Io`] or [`Error::Format`] if the directory's files cannot be read; [`Error::Argument`] names
+    /// a tensor that it has in another shape or that these files do not ask for, or says that it is asked in another way.
+    pub fn write_grown(&self, dir: &Path, seed: u64, from: &Path) -> Result<usize> {
+        let found = Settings::from_file(&from.join(SETTINGS))?.of_the_shape();
+        let wanted = self.parse()?.settings.of_the_shape();
+        if (Settings { wide_glimpse: wanted.wide_glimpse, ..found }) != wanted {
+            let found = from.join(SETTINGS).display().to_string();
+            return Err(Error::argument(
+                "sdim.json",
+                found,
+                "the way of asking of the shape, but for wide crops",
+            ));
+        }
+        let path = from.join(MODEL);
         let bytes = std::fs::read(&path).map_err(Error::io(&path))?;
         let old = candle_core::safetensors::load_buffer(&bytes, &Device::Cpu)
             .map_err(|e| Error::format(&path, e.to_string(), "tensors in safetensors"))?;
         let mut tensors = self.initial(seed)?;
-        let mut found = 0;
-        for (name, tensor) in &mut tensors {
-            if let Some(known) = old.get(name).filter(|known| known.dims() == tensor.dims()) {
-                *tensor = known.to_dtype(candle_core::DType::F32)?;
-                found += 1;
+        let fresh = tensors.keys().filter(|name| !old.contains_key(*name)).count();
+        for (name, tensor) in old {
+            match tensors.get_mut(&name) {
+                Some(own) if own.dims() == tensor.dims() => {
+                    *own = tensor.to_dtype(candle_core::DType::F32)?
+                }
+                own => {
+                    let expected = own.map_or("none".to_string(), |own| format!("{:?}", own.dims()));
+                    let found = format!("{:?} in {}", tensor.dims(), path.display());
+                    return Err(Error::argument("tensor", format!("{name}: {found}"), expected));
+                }
             }
         }
-        if found == 0 {
-            return Err(Error::argument(
-                "checkpoint to start from",
-                from.display(),
-                "the directory of a small checkpoint",
-            ));
-        }
         self.write(dir)?;
-        write_tensors(&dir.join(WEIGHTS), &tensors)
+        write_tensors(&dir.join(MODEL), &tensors)?;
+        Ok(fresh)
     }
 
     /// Reads them from a checkpoint directory.
@@ -215,8 +224,8 @@ mod tests {
         let before = Settings { wide_glimpse: None, ..Settings::tiny() };
         FreshFiles::tiny(&before).unwrap().write_initial(&old, 1).unwrap();
         let files = FreshFiles::tiny(&Settings::tiny()).unwrap();
-        files.write_grown(&grown, 2, &old).unwrap();
-        let read = |dir: &Path| candle_core::safetensors::load(dir.join(WEIGHTS), &Device::Cpu).unwrap();
+        assert_eq!(files.write_grown(&grown, 2, &old).unwrap(), 3);
+        let read = |dir: &Path| candle_core::safetensors::load(dir.join(MODEL), &Device::Cpu).unwrap();
         let (known, found) = (read(&old), read(&grown));
         let values = |t: &Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
         for (name, tensor) in &found {
@@ -229,10 +238,20 @@ mod tests {
         assert!(values(&found["sdim.wide_glimpse.down.weight"]).iter().all(|v| *v == 0.0));
         assert_eq!(FreshFiles::load(&grown).unwrap(), files);
         assert!(matches!(files.write_grown(&grown, 2, &dir.path().join("none")), Err(Error::Io { .. })));
-        std::fs::write(old.join(WEIGHTS), "no tensors").unwrap();
+        std::fs::write(old.join(MODEL), "no tensors").unwrap();
         assert!(matches!(files.write_grown(&grown, 2, &old), Err(Error::Format { .. })));
-        let other = [("lm_head.bias".to_string(), known["model.norm.weight"].clone())];
-        write_tensors(&old.join(WEIGHTS), other.iter().map(|(n, t)| (n, t))).unwrap();
-        assert!(matches!(files.write_grown(&grown, 2, &old), Err(Error::Argument { .. })));
+        // One tensor too many, one of another shape, another way of asking.
+        for name in ["lm_head.bias", "sdim.glimpse.weight"] {
+            let other = [(name.to_string(), known["model.norm.weight"].clone())];
+            write_tensors(&old.join(MODEL), other.iter().map(|(n, t)| (n, t))).unwrap();
+            let refused = files.write_grown(&grown, 2, &old);
+            assert!(
+                matches!(&refused, Err(Error::Argument { found, .. }) if found.contains(name)),
+                "{refused:?}"
+            );
+        }
+        let metres = Settings { unit: crate::query::DepthUnit::Metres, ..before };
+        FreshFiles::tiny(&metres).unwrap().write_initial(&old, 1).unwrap();
+        assert!(matches!(files.write_grown(&grown, 2, &old), Err(Error::Argument { .. })), "other units");
     }
 }

@@ -50,7 +50,8 @@ def save_state(directory, **parts):
 def load_state(directory, device, settings):
     """A run's state; `settings` are those that it must have been started with."""
     state = torch.load(directory / STATE, map_location=device, weights_only=True)
-    other = {k: (state["settings"].get(k), v) for k, v in settings.items() if state["settings"].get(k) != v}
+    known = {"sharp": False} | state["settings"]
+    other = {k: (known.get(k), v) for k, v in settings.items() if known.get(k) != v}
     if other:
         said = ", ".join(f"{k} {old} there, {new} now" for k, (old, new) in other.items())
         raise SystemExit(f"{directory / STATE}: another run's state: {said}")

@@ -22,7 +22,7 @@ from .records import Pool, held_out
 
 # What a resumed run must share with its beginning, since the schedule or the order of the data depends on it.
 KEPT = ("seed", "batch", "rate", "warmup", "steps", "weight_decay", "l1", "average", "freeze_norm_at", "sharp")
-COUNTED = ("step", "skipped", "spent", "best", "trouble", "slow", "returns")
+COUNTED = ("step", "skipped", "spent", "best", "trouble", "slow", "returns", "returned_at")
 BN_MOMENTUM = 0.05
 # So many steps one after the other that are not finite are no accident.
 MOST_SKIPPED = 100
@@ -90,7 +90,7 @@ class Trainer:
         gpu = device.type == "cuda"
         self.optimiser = torch.optim.AdamW(groups, lr=chosen.rate, betas=(0.9, 0.98), eps=1e-8, fused=gpu)
         self.step, self.skipped, self.in_a_row, self.spent, self.best = 0, 0, 0, 0.0, math.inf
-        self.trouble, self.slow, self.returns = 0.0, 1.0, 0
+        self.trouble, self.slow, self.returns, self.returned_at = 0.0, 1.0, 0, 0
         if chosen.resume:
             self.load()
         self.bf16 = gpu if chosen.precision is None else chosen.precision == "bf16"
@@ -143,14 +143,14 @@ class Trainer:
         return loss, l1, norm
 
     def go_back(self):
-        """To the moving average, without moments, at half the rate."""
+        """To the moving average, without moments, at half the rate, after another warm-up."""
         self.model.load_state_dict(self.average.state_dict())
         self.optimiser.state.clear()
-        self.trouble, self.slow, self.returns = 0.0, self.slow / 2, self.returns + 1
+        self.trouble, self.slow, self.returns, self.returned_at = 0.0, self.slow / 2, self.returns + 1, self.step
 
     def rate(self, progress):
         """Linear warm-up by steps, times a cosine down to a hundredth; halved by each return to the average."""
-        warm = min(1.0, (self.step + 1) / max(1, self.chosen.warmup))
+        warm = min(1.0, (self.step - self.returned_at + 1) / max(1, self.chosen.warmup))
         return self.slow * self.chosen.rate * warm * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(1.0, progress))))
 
     @torch.no_grad()
@@ -202,7 +202,8 @@ class Trainer:
         for name in ("model", "average", "optimiser"):
             getattr(self, name).load_state_dict(state[name])
         for name in COUNTED:
-            setattr(self, name, state[name])
+            # States of before the returns have none of their counts.
+            setattr(self, name, state.get(name, getattr(self, name)))
 
 
 class Schedule:

@@ -94,8 +94,8 @@ def test_a_run_that_leaves_what_is_finite_goes_back_to_its_average_more_slowly(t
     assert all(torch.equal(v, average[k]) for k, v in trainer.model.state_dict().items())
     _, _, norm = trainer.train_step(batch, 0.0)
     assert math.isfinite(norm) and trainer.in_a_row == 0 and trainer.slow == 0.5
-    # The warm-up went on meanwhile: the same place of the schedule, half the rate.
-    trainer.step = 11
+    # The same place of the schedule and of the warm-up, which began anew: half the rate.
+    trainer.step = trainer.returned_at + 12
     assert trainer.rate(0.3) == pytest.approx(rate / 2)
     # Single steps that are lost are no reason.
     for i in range(40):
@@ -120,6 +120,7 @@ def test_a_mirrored_frame_mirrors_all_of_it(tmp_path):
     _, pool, _ = trainer_and_batch(tmp_path)
     plain, turned = (assemble([(pool.shards[0], 1, 0, m)]) for m in (False, True))
     assert torch.equal(plain.rgb.flip(2), turned.rgb) and torch.equal(plain.depth.flip(2), turned.depth)
+    assert torch.equal(plain.interpolated.flip(2), turned.interpolated)
     for name in ("told_at", "asked_at"):
         a, b = getattr(plain, name), getattr(turned, name)
         assert torch.equal(a[..., 0] + b[..., 0], torch.full_like(a[..., 0], 79)) and torch.equal(a[..., 1], b[..., 1])

@@ -1,7 +1,8 @@
 //! Crops around places of a frame, cut where the model is.
 
+use super::bilinear::LARGEST;
 use super::preprocess::PreprocessorConfig;
-use crate::error::Result;
+use crate::error::{Error, Result};
 use candle_core::{DType, Device, Tensor};
 use image::RgbImage;
 use rayon::prelude::*;
@@ -32,8 +33,11 @@ impl<'a> Picture<'a> {
     /// `[places, 3 * side * side]`, f32, a crop as channel, y, x.
     ///
     /// # Errors
-    /// [`Error::Tensors`](crate::Error::Tensors) if the device refuses them.
+    /// [`Error::Argument`] for a side over 64; [`Error::Tensors`] if the device refuses them.
     pub fn crops(&self, config: &PreprocessorConfig, places: &[(f32, f32)], side: usize) -> Result<Tensor> {
+        if side > LARGEST {
+            return Err(Error::argument("side of a crop", side, format!("at most {LARGEST}")));
+        }
         let size = (self.image.width() as usize, self.image.height() as usize);
         if let Some(samples) = &self.samples {
             return in_parts(places, side, 3, |some| cut(samples, size, config, some, side));

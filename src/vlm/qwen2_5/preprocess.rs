@@ -194,8 +194,8 @@ impl PreprocessorConfig {
     }
 
     /// A normalised crop of `side` x `side` pixels around a place between pixels, bilinear, the border repeated; written as
-    /// channel, y, x into `out`, which holds 3 x `side` x `side` values.
-    pub fn crop(&self, image: &RgbImage, x: f32, y: f32, side: usize, out: &mut [f32]) {
+    /// channel, y, x into `out`, which holds 3 x `side` x `side` values; `side` is at most 64.
+    pub(super) fn crop(&self, image: &RgbImage, x: f32, y: f32, side: usize, out: &mut [f32]) {
         let size = (image.width() as usize, image.height() as usize);
         let (scale, shift) = self.scale_and_shift();
         bilinear::<3, u8>(image.as_raw(), size, (x, y), side, |dy, row| {

@@ -60,6 +60,8 @@ class QwenSdim(nn.Module):
         text, vision = base.config.text_config, base.config.vision_config
         if settings["rope_layout"] != "contiguous":
             raise ValueError("sdim.json, rope_layout: a published checkpoint has contiguous sections")
+        if settings.get("wide_glimpse"):
+            raise ValueError("sdim.json, wide_glimpse: wide crops are trained with records, by sdim_training.train")
         parts, bins = {}, settings["number"].get("bins")
         if settings["fusion"]:
             parts = {"fusion": Fusion(**settings["fusion"]), "patch_embed": SecondPatchEmbed(vision)}
