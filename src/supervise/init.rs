@@ -1,13 +1,13 @@
 //! A fresh small checkpoint: its files and its initial weights.
 
 use super::shape::Shape;
-use super::store::MODEL;
 use super::vocabulary::byte_tokenizer;
 use crate::error::{Error, Result};
 use crate::files::{read_text, write_tensors, write_whole};
 use crate::model::{CheckpointFiles, SETTINGS, SdimModel, initial};
 use crate::query::number::Numbers;
 use crate::query::{NumberTokens, Settings};
+use crate::vlm::checkpoint::shards::SINGLE;
 use crate::vlm::checkpoint::weights::Weights;
 use crate::vlm::files::{CONFIG, PREPROCESSOR, TOKENIZER};
 use candle_core::{Device, Tensor};
@@ -100,7 +100,7 @@ impl FreshFiles {
     /// As [`FreshFiles::initial`]; [`Error::Io`].
     pub fn write_initial(&self, dir: &Path, seed: u64) -> Result<()> {
         self.write(dir)?;
-        write_tensors(&dir.join(MODEL), &self.initial(seed)?)
+        write_tensors(&dir.join(SINGLE), &self.initial(seed)?)
     }
 
     /// As [`FreshFiles::write_initial`], with the tensors of a checkpoint directory: where the training of a model goes on that has grown a
@@ -120,7 +120,7 @@ impl FreshFiles {
                 "the way of asking of the shape, but for wide crops",
             ));
         }
-        let path = from.join(MODEL);
+        let path = from.join(SINGLE);
         let bytes = std::fs::read(&path).map_err(Error::io(&path))?;
         let old = candle_core::safetensors::load_buffer(&bytes, &Device::Cpu)
             .map_err(|e| Error::format(&path, e.to_string(), "tensors in safetensors"))?;
@@ -139,7 +139,7 @@ impl FreshFiles {
             }
         }
         self.write(dir)?;
-        write_tensors(&dir.join(MODEL), &tensors)?;
+        write_tensors(&dir.join(SINGLE), &tensors)?;
         Ok(fresh)
     }
 
@@ -225,7 +225,7 @@ mod tests {
         FreshFiles::tiny(&before).unwrap().write_initial(&old, 1).unwrap();
         let files = FreshFiles::tiny(&Settings::tiny()).unwrap();
         assert_eq!(files.write_grown(&grown, 2, &old).unwrap(), 3);
-        let read = |dir: &Path| candle_core::safetensors::load(dir.join(MODEL), &Device::Cpu).unwrap();
+        let read = |dir: &Path| candle_core::safetensors::load(dir.join(SINGLE), &Device::Cpu).unwrap();
         let (known, found) = (read(&old), read(&grown));
         let values = |t: &Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
         for (name, tensor) in &found {
@@ -238,12 +238,12 @@ mod tests {
         assert!(values(&found["sdim.wide_glimpse.down.weight"]).iter().all(|v| *v == 0.0));
         assert_eq!(FreshFiles::load(&grown).unwrap(), files);
         assert!(matches!(files.write_grown(&grown, 2, &dir.path().join("none")), Err(Error::Io { .. })));
-        std::fs::write(old.join(MODEL), "no tensors").unwrap();
+        std::fs::write(old.join(SINGLE), "no tensors").unwrap();
         assert!(matches!(files.write_grown(&grown, 2, &old), Err(Error::Format { .. })));
         // One tensor too many, one of another shape, another way of asking.
         for name in ["lm_head.bias", "sdim.glimpse.weight"] {
             let other = [(name.to_string(), known["model.norm.weight"].clone())];
-            write_tensors(&old.join(MODEL), other.iter().map(|(n, t)| (n, t))).unwrap();
+            write_tensors(&old.join(SINGLE), other.iter().map(|(n, t)| (n, t))).unwrap();
             let refused = files.write_grown(&grown, 2, &old);
             assert!(
                 matches!(&refused, Err(Error::Argument { found, .. }) if found.contains(name)),

@@ -10,7 +10,7 @@ use std::collections::HashMap;
 use std::path::Path;
 
 /// File of the published weights.
-pub(super) const MODEL: &str = "model.safetensors";
+const MODEL: &str = "model.safetensors";
 /// File of the state to resume from.
 const STATE: &str = "trainer.safetensors";
 
